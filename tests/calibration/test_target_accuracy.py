@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from astropolcal.calibration import calibrate
 from astropolcal.calibration.noise.scatter import groups_by, leave_out_groups
-from astropolcal.calibration.validation import paper_accuracies, target_accuracy
+from astropolcal.calibration.validation import paper_accuracies
 from astropolcal.calibration.validation.targets import propagate_accuracy
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.measurement import Measurement
@@ -89,56 +89,6 @@ def test_impossible_targets_are_refused():
 # --- tables -------------------------------------------------------------------------
 
 
-def test_table_of_all_three_calibrations():
-    table = target_accuracy(
-        1 * u.percent,
-        0 * u.deg,
-        polarized=accuracy(1, 2, 3),
-        unpolarized=accuracy(0.03, 0.0, 0.05),
-        on_sky=accuracy(0.04, 0.02, 0.12),
-    )
-    np.testing.assert_allclose(percent(table["s_abs"]), [0.05, 0.02, 0.13])
-    np.testing.assert_allclose(percent(table["s_p"]), [0.06, 0.04, 0.16])
-    np.testing.assert_allclose(percent(table["s_U"]), percent(table["s_abs"]))
-    assert table.meta["missing"] == []
-    assert table["s_chi"].unit == u.deg
-
-
-def test_missing_calibrations_are_said():
-    table = target_accuracy(0.3, 50 * u.deg, polarized=accuracy(1, 2, 3))
-    assert table.meta["missing"] == ["unpolarized", "on_sky"]
-    assert "lower limits" in table.meta["words"]
-    for column in ("s_unpol", "s_sky", "s_abs"):
-        assert np.isnan(table[column]).all()
-    expected = propagate_accuracy(0.3, 50 * u.deg, [1, 2, 3] * u.percent, 0.0)
-    np.testing.assert_allclose(table["s_p"], expected["s_p"])
-    with pytest.raises(ParameterError, match="no accuracy is given"):
-        target_accuracy(0.3, 50 * u.deg)
-
-
-def test_target_may_depend_on_wavelength():
-    p, chi = [0.0, 0.1, 1.0], [0, 15, 30] * u.deg
-    table = target_accuracy(p, chi, polarized=accuracy(1, 2, 3), on_sky=accuracy(0.1, 0.2, 0.3))
-    for i in range(3):
-        one = propagate_accuracy(p[i], chi[i], (i + 1) * u.percent, 0.1 * (i + 1) * u.percent)
-        assert percent(table["s_p"])[i] == pytest.approx(percent(one["s_p"]))
-    with pytest.raises(ParameterError, match=r"dolp has shape \(2,\)"):
-        target_accuracy([0.1, 0.2], 0 * u.deg, polarized=accuracy(1, 2, 3))
-
-
-def test_other_accuracies_may_be_taken():
-    table = accuracy(1, 2, 3)
-    table["s_cv"] = 5 * table["s_mean"]
-    found = target_accuracy(1.0, 0 * u.deg, polarized=table, column="s_cv")
-    np.testing.assert_allclose(percent(found["s_rel"]), [5, 10, 15])
-    with pytest.raises(ParameterError, match="polarized: no column 's_rms'"):
-        target_accuracy(1.0, 0 * u.deg, polarized=table, column="s_rms")
-    # wavelengths must agree
-    star = accuracy(0.1, 0.1, 0.1, wavelength=LAM * 1.01)
-    with pytest.raises(ParameterError, match="on_sky: 3 wavelengths from"):
-        target_accuracy(1.0, 0 * u.deg, polarized=accuracy(1, 2, 3), on_sky=star)
-
-
 def test_paper_range_for_a_target_of_1_percent(charis_data, shared_data):
     """
     Published: s_p from 0.02 to 0.12 % for 1 % at 50 deg (Sec. 7.2).
@@ -153,13 +103,14 @@ def test_paper_range_for_a_target_of_1_percent(charis_data, shared_data):
     mirror = Table.read(reference / "charis_fold_mirror.ecsv")
     wavelength = np.array(fits["wavelength"]) * u.nm
     unpol = [np.mean(mirror["s_unpol"][mirror["bin"] == b]) for b in range(22)]
-    table = target_accuracy(
-        1 * u.percent,
-        50 * u.deg,
-        polarized=accuracy(*fits["s_rel_elliptical_dataset3"], wavelength=wavelength),
-        unpolarized=accuracy(*unpol, wavelength=wavelength),
-        on_sky=accuracy(*_scatter_of_star(charis_data("hd293396_")), wavelength=wavelength),
-    )
+    parts = {
+        "polarized": fits["s_rel_elliptical_dataset3"],
+        "unpolarized": unpol,
+        "unpolarized standard star": _scatter_of_star(charis_data("hd293396_")),
+    }
+    tables = [(kind, accuracy(*part, wavelength=wavelength)) for kind, part in parts.items()]
+    cal = _calibration(tables, [None] * 3, wavelength)
+    (table,) = paper_accuracies(cal, [(1 * u.percent, 50 * u.deg)])
     s_p = percent(table["s_p"])
     assert 0.015 < s_p.min() < 0.025
     assert 0.08 < s_p.max() < 0.14
@@ -222,9 +173,14 @@ def test_kind_of_calibration_follows_from_the_source(chain):
         assert table.meta["missing"] == [
             k for k in ("polarized", "unpolarized", "on_sky") if k != kind
         ]
-        expected = target_accuracy(0.1, 15 * u.deg, **{kind: accuracy(1, 2, 3)})
-        for column in expected.colnames:
-            np.testing.assert_array_equal(table[column], expected[column])
+        assert "lower limits" in table.meta["words"]
+        parts = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
+        for one, column in parts.items():
+            expected = [1, 2, 3] if one == kind else [np.nan] * 3
+            np.testing.assert_allclose(percent(table[column]), expected)
+        both = ([1, 2, 3], 0.0) if kind == "polarized" else (0.0, [1, 2, 3])
+        expected = propagate_accuracy(0.1, 15 * u.deg, *(part * u.percent for part in both))
+        np.testing.assert_allclose(table["s_p"], expected["s_p"])
 
 
 def test_a_source_that_is_not_stated_is_told_by_its_polarizer(chain):
@@ -268,8 +224,6 @@ def test_impossible_targets_of_a_calibration_are_refused(chain):
     for target in ((2.0, None), (np.nan, None), (0.5, 1 * u.um)):
         with pytest.raises(ParameterError):
             paper_accuracies(cal, [target])
-    with pytest.raises(ParameterError, match="no column 's_rms'"):
-        paper_accuracies(cal, column="s_rms")
 
 
 def _scatter_of_star(observations):

@@ -3,6 +3,6 @@
 
 from astropolcal.calibration.validation.cross_validation import lack_of_fit
 from astropolcal.calibration.validation.stars import star_accuracy, star_stokes
-from astropolcal.calibration.validation.targets import paper_accuracies, target_accuracy
+from astropolcal.calibration.validation.targets import paper_accuracies
 
-__all__ = ["lack_of_fit", "paper_accuracies", "star_accuracy", "star_stokes", "target_accuracy"]
+__all__ = ["lack_of_fit", "paper_accuracies", "star_accuracy", "star_stokes"]

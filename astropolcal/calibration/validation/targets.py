@@ -19,13 +19,12 @@ from astropolcal.calibration.uncertainty.covariance import full_covariance
 from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.files import columns
-from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.optics import LinearPolarizer
 from astropolcal.stokes import angle_error
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice
 
-__all__ = ["paper_accuracies", "target_accuracies", "target_accuracy"]
+__all__ = ["paper_accuracies", "target_accuracies"]
 
 KEYS = ("s_Q", "s_U", "s_p", "s_chi")
 # of a sum of products, relative to its terms
@@ -74,7 +73,7 @@ def _products(rows):
     return rows @ np.swapaxes(rows, -1, -2)
 
 
-# ---- what an accuracy means for a target, and four accuracies side by side ----
+# ---- what an accuracy means for a target ----
 
 
 #: Degrees and angles of polarization that are reported; an angle of None is any.
@@ -82,7 +81,6 @@ TARGETS = ((30 * u.percent, None), (1 * u.percent, None), (0.1 * u.percent, None
 #: Those of the paper.
 PAPER_TARGETS = ((1 * u.percent, None), (30 * u.percent, None))
 
-_COLUMNS = ("s_mean", "s_res", "s_cv")
 _CALIBRATIONS = {"polarized": "s_rel", "unpolarized": "s_unpol", "on_sky": "s_sky"}
 # where s_Q, s_U, s_p and s_chi are largest: between these angles each rises or falls steadily
 _EXTREMES = (0.0, 22.5, 45.0) * u.deg
@@ -247,125 +245,37 @@ def _fraction(name, value, limit=np.inf):
     return number
 
 
-def target_accuracy(dolp, aolp, *, polarized=None, unpolarized=None, on_sky=None, column="s_mean"):
-    """
-    Return the accuracy of a calibrated instrument for a target, per wavelength.
-
-    Parameters
-    ----------
-    dolp : `~astropy.units.Quantity` or float
-        The target's degree of linear polarization; scalar or one per wavelength.
-    aolp : `~astropy.units.Quantity`
-        Its angle of linear polarization; scalar or one per wavelength.
-    polarized, unpolarized, on_sky : `~astropy.table.QTable`, optional
-        Accuracies of the calibrations with the internal source polarized (s_rel) and unpolarized
-        (s_unpol) and on an unpolarized standard star (s_sky), such as ``Calibration.accuracy``.
-        What is missing counts as zero; its column is NaN and ``meta["words"]`` names it.
-    column : {"s_mean", "s_res", "s_cv"}
-        Which accuracy to take: the paper's is ``s_mean``, the error of a
-        prediction at one setting is ``s_cv``.
-
-    Returns
-    -------
-    `~astropy.table.QTable`
-        Columns ``wavelength``, ``s_rel``, ``s_unpol``, ``s_sky``, ``s_abs``, ``s_Q``,
-        ``s_U``, ``s_p`` (percent) and ``s_chi`` (degree), by the equations of the paper (Sec. 2.3);
-        meta ``column``, ``missing`` and ``words``.
-
-    Raises
-    ------
-    ParameterError
-        If there is no table at all, they have no such column, their wavelengths
-        differ, or the target is impossible.
-
-    Examples
-    --------
-    >>> from astropolcal.calibration.validation import target_accuracy
-    >>> import astropy.units as u
-    >>> from astropy.table import QTable
-    >>> lam = [1.2, 1.6] * u.um
-    >>> lamp = QTable({"wavelength": lam, "s_mean": [0.10, 0.05] * u.percent})
-    >>> star = QTable({"wavelength": lam, "s_mean": [0.03, 0.02] * u.percent})
-    >>> table = target_accuracy(1 * u.percent, 0 * u.deg, polarized=lamp, on_sky=star)
-    >>> table["s_p"].round(4)
-    <Quantity [0.031 , 0.0205] %>
-    >>> table.meta["missing"]
-    ['unpolarized']
-    """
-    given = {"polarized": polarized, "unpolarized": unpolarized, "on_sky": on_sky}
-    present = {name: table for name, table in given.items() if table is not None}
-    if not present:
-        raise ParameterError(f"no accuracy is given; at least one of {', '.join(given)} is needed")
-    wavelength = next(iter(present.values()))["wavelength"]
-    found = {name: _values(name, table, column, wavelength) for name, table in present.items()}
-    for name, value in (("dolp", dolp), ("aolp", aolp)):
-        if np.shape(value) not in ((), wavelength.shape):
-            raise ParameterError(
-                f"{name} has shape {np.shape(value)}; allowed are () and {wavelength.shape}, "
-                "one per wavelength"
-            )
-    zero = np.zeros(len(wavelength)) * u.percent
-    s_rel, s_unpol, s_sky = (found.get(name, zero) for name in given)
-    # the error that scales with the intensity
-    s_abs = np.hypot(s_unpol, s_sky)
-    result = QTable({"wavelength": wavelength})
-    for name, key in _CALIBRATIONS.items():
-        result[key] = found.get(name, zero * np.nan)
-    result["s_abs"] = s_abs if "unpolarized" in found or "on_sky" in found else zero * np.nan
-    result.update(propagate_accuracy(dolp, aolp, s_rel, s_abs))
-    missing = [name for name in given if name not in found]
-    words = f"all three calibrations count, by their {column}"
-    if missing:
-        lacking = ", ".join(f"{name} ({_CALIBRATIONS[name]})" for name in missing)
-        words = f"by {column}; without the calibration {lacking}: the accuracies are lower limits"
-    result.meta |= {"column": column, "missing": missing, "words": words}
-    return result
-
-
-def _values(name, table, column, wavelength):
-    if column not in _COLUMNS or column not in table.colnames:
-        raise ParameterError(
-            f"{name}: no column {column!r}; allowed are {', '.join(_COLUMNS)}, if present"
-        )
-    own = table["wavelength"]
-    if own.shape != wavelength.shape or not u.allclose(own, wavelength, rtol=SAME_WAVELENGTH):
-        raise ParameterError(
-            f"{name}: {len(own)} wavelengths from {own.min():.6g} to {own.max():.6g} are not the "
-            f"{len(wavelength)} from {wavelength.min():.6g} to {wavelength.max():.6g} of the others"
-        )
-    return u.Quantity(table[column]).to(u.percent)
-
-
-def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
+def paper_accuracies(calibration, targets=PAPER_TARGETS):
     """
     Return the paper's accuracy of a calibration for several targets, per wavelength.
 
     It follows from residuals alone, and knows neither telescope nor correlations: what a
     calibration claims is ``target_accuracies``. Which datasets give s_rel, s_unpol and s_sky
-    follows from their sources: s_sky is that of unpolarized standard stars. Several of one kind
-    count by the rms of their accuracies. Where no dataset of a kind was fitted, a standard of
-    that kind counts that was predicted, see `~astropolcal.calibration.add_standard`.
+    follows from their sources: s_sky is that of unpolarized standard stars. They are the ``s_mean``
+    of these datasets; several of one kind count by the rms of theirs. Where no dataset of a kind
+    was fitted, a standard of that kind counts that was predicted, see
+    `~astropolcal.calibration.add_standard`.
 
     Parameters
     ----------
     calibration : Calibration
         The calibration; one read from a file will do.
     targets : sequence of (dolp, aolp)
-        Degree and angle of linear polarization of each, as for `target_accuracy`. An angle of None
-        stands for any: the accuracies are then the largest over all angles.
-    column : {"s_mean", "s_res", "s_cv"}
-        Which accuracy of the calibration to take.
+        Degree and angle of linear polarization of each. An angle of None stands for any: the
+        accuracies are then the largest over all angles.
 
     Returns
     -------
     list of `~astropy.table.QTable`
-        As `target_accuracy` gives them, one per target, with ``dolp`` and ``aolp`` in the
-        meta; none if no dataset is of a known kind.
+        One per target, with columns ``wavelength``, ``s_rel``, ``s_unpol``, ``s_sky``, ``s_abs``,
+        ``s_Q``, ``s_U``, ``s_p`` (percent) and ``s_chi`` (degree), by the equations of the paper
+        (Sec. 2.3), and meta ``dolp``, ``aolp``, ``missing`` and ``words``: a kind that is missing
+        counts as zero, and its column is NaN. None if no dataset is of a known kind.
 
     Raises
     ------
     ParameterError
-        If a target is impossible or there is no such column.
+        If a target is impossible.
 
     Examples
     --------
@@ -377,19 +287,29 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS, column="s_mean"):
     >>> table.meta["missing"]
     ['unpolarized', 'on_sky']
     """
-    tables = _tables_of_kinds(calibration, column)
-    found = []
+    found, parts = [], _parts_of_kinds(calibration)
+    missing = [name for name in _CALIBRATIONS if name not in parts]
+    zero = np.zeros(calibration.wavelength.size) * u.percent
+    s_rel, s_unpol, s_sky = (parts.get(name, zero) for name in _CALIBRATIONS)
+    # the error that scales with the intensity
+    s_abs = np.hypot(s_unpol, s_sky)
+    table = QTable({"wavelength": calibration.wavelength})
+    for name, key in _CALIBRATIONS.items():
+        table[key] = parts.get(name, zero * np.nan)
+    table["s_abs"] = zero * np.nan if {"unpolarized", "on_sky"} <= {*missing} else s_abs
+    words = "all three calibrations count"
+    if missing:
+        lacking = ", ".join(f"{name} ({_CALIBRATIONS[name]})" for name in missing)
+        words = f"without the calibration {lacking}: the accuracies are lower limits"
     for dolp, aolp in targets:
-        propagate_accuracy(dolp, 0 * u.deg if aolp is None else aolp, 0.0, 0.0)
-        if not tables:
-            continue
         angles = _EXTREMES if aolp is None else [aolp]
-        each = [target_accuracy(dolp, angle, **tables, column=column) for angle in angles]
+        each = [propagate_accuracy(dolp, angle, s_rel, s_abs) for angle in angles]
+        own = table.copy()
         for key in KEYS:
-            each[0][key] = np.max([table[key].value for table in each], axis=0) * each[0][key].unit
-        each[0].meta |= {"dolp": dolp, "aolp": aolp}
-        found.append(each[0])
-    return found
+            own[key] = np.max([one[key].value for one in each], axis=0) * each[0][key].unit
+        own.meta |= {"dolp": dolp, "aolp": aolp, "missing": missing, "words": words}
+        found.append(own)
+    return found if parts else []
 
 
 def _kind(source, chain):
@@ -407,33 +327,31 @@ def _kind(source, chain):
     return "polarized" if isinstance(leaves(chain)[0], LinearPolarizer) else None
 
 
-def _tables_of_kinds(calibration, column):
-    """Return the accuracies of each kind of dataset on the calibration's wavelengths.
+def _parts_of_kinds(calibration):
+    """Return the accuracy of each kind of dataset at the calibration's wavelengths.
 
-    Of a kind that was not fitted they are those of the standards that were predicted.
+    Of a kind that was not fitted it is that of the standards that were predicted.
     """
     grid, fitted, predicted = calibration.wavelength, {}, {}
     for record, chain in zip(calibration.datasets, calibration.chains, strict=True):
         kind = _kind(record.source, chain)
         rows = fitted.setdefault(kind, [])
         if kind is not None and record.accuracy is not None:
-            own = record.accuracy["wavelength"]
-            rows.append((own, _values(kind, record.accuracy, column, own).value ** 2))
+            square = record.accuracy["s_mean"].to_value(u.percent) ** 2
+            rows.append((record.accuracy["wavelength"], square))
     # a diagnosis asks with what has no fit
     for entry in getattr(calibration, "fit", {}).get("standards", []):
         own, n = np.array(entry["wavelength_nm"]) * u.nm, np.array(entry["n"], dtype=float)
-        square = np.array(entry["s_standard_percent"], dtype=float) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             # nothing was fitted: its rms over sqrt(n) is what s_mean is for a fit
-            square = square / n if column == "s_mean" else square
+            square = np.array(entry["s_standard_percent"], dtype=float) ** 2 / n
         predicted.setdefault(_kind(entry["source"], None), []).append((own, square))
-    tables = {}
+    parts = {}
     for kind, several in (predicted | fitted).items():
         # a dataset may cover a part of the grid; the rest stays unknown
         rows = np.full((len(several), grid.size), np.nan)
         for row, (own, square) in zip(rows, several, strict=True):
             row[np.abs(own[:, None] - grid).argmin(axis=1)] = square
         if kind is not None and several:
-            mean = np.sqrt(mean_of_known(rows.T)) * u.percent
-            tables[kind] = QTable({"wavelength": grid, column: mean})
-    return tables
+            parts[kind] = np.sqrt(mean_of_known(rows.T)) * u.percent
+    return parts
