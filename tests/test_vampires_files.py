@@ -287,7 +287,7 @@ def test_masters_of_other_settings_are_told(copied):
         ("flat", {word: "675-50"}, "filter = 625-50, but 675-50 in its flat"),
     ):
         for camera in (1, 2):
-            image = np.full(size, float(kind == "flat"))
+            image = np.full(size, 1.0 if kind == "flat" else 1e-3)
             header = fits.Header(cards | changes)
             fits.writeto(copied / f"{kind}_cam{camera}.fit", image, header, overwrite=True)
         for path in copied.glob("*.fits"):
