@@ -37,17 +37,17 @@ from astropolcal.calibration.fit.evidence import (
     log_evidence,
 )
 from astropolcal.calibration.identifiability.sky import known_instrument
+from astropolcal.calibration.system import free_of
 from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
 from astropolcal.calibration.validation.targets import keep_sky_accuracy, target_accuracies
 from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import FitError, ParameterError, warn
 from astropolcal.measurement import parameter_table
-from astropolcal.measurement.parameters import ties_among
+from astropolcal.measurement.parameters import declared_step, ties_among
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.headers import date_of
-from astropolcal.pipeline.library import Library
 from astropolcal.words import listed, p_words
 
 __all__ = ["Change", "changes", "courses", "parameter_history", "restart"]
@@ -66,7 +66,8 @@ _CHANGE = 0.05
 
 def named_by_date(calibrations):
     """Return (name, calibration) by date of their data; of such pairs the names stay."""
-    if isinstance(calibrations, Library):
+    # a library, which itself compares calibrations
+    if hasattr(calibrations, "_in_force"):
         if calibrations.problems:
             path, reason = next(iter(calibrations.problems.items()))
             raise ParameterError(f"{path}: {reason}")
@@ -230,16 +231,18 @@ def _log_p(chi2, dof):
     return (half - 1) * np.log(x) - x - gammaln(half) + np.log1p((half - 1) / x)
 
 
-def significance(calibrations, parameters=None):
+def significance(calibrations, parameters=None, *, shared=False):
     """Return how surely parameters differ between two or more calibrations, a `Change`.
 
     The chi-square of one set of values for all, each with its covariance, in the directions that
     all determine. A fit in another mirror branch counts as a change, so start it from the earlier
-    one.
+    one. Those of ``shared`` data differ by less than their errors.
     """
     named = named_by_date(calibrations)
     if len(named) < 2:
         raise FitError(f"{len(named)} calibration: at least two are needed to compare")
+    if not shared:
+        _check_independent(named)
     found = compared(named, parameters)
     apart = found.deviations
     # of one common value for all
@@ -265,8 +268,26 @@ class Compared:
     weights: np.ndarray
 
 
-def compared(named, parameters=None):
-    """Return what calibrations of independent data say of the same parameters, `Compared`."""
+def moved(earlier, later):
+    """Return by how many sigma the parameters of each optic differ, of all under ""."""
+    named = [("earlier", earlier), ("later", later)]
+    wanted = {"": None} | {optic: [optic] for optic in optics_of(named)}
+    found = {key: significance(named, names, shared=True) for key, names in wanted.items()}
+    return {key: change.sigma for key, change in found.items() if change.dof}
+
+
+def shift(earlier, later):
+    """Return by how much parameters differ, in their units, in what both determine."""
+    found = compared([("earlier", earlier), ("later", later)])
+    units = dict(zip(earlier.covariance.names, earlier.covariance.units, strict=True))
+    # slopes are orthonormal per step
+    squares = np.array([declared_step(units[name]) for name in found.names]) ** 2
+    change = squares * ((found.deviations[1] - found.deviations[0]) @ found.slopes)
+    return dict(zip(found.names, change, strict=True))
+
+
+def _check_independent(named):
+    """Refuse calibrations of shared data, and warn of errors that lack those of what is held."""
     seen = {}
     for i, (name, calibration) in enumerate(named):
         for record in calibration.datasets:
@@ -279,7 +300,11 @@ def compared(named, parameters=None):
     if held := [name for name, one in named if one.settings.get("restarted")]:
         words = f"{listed(held)}: holds what another calibration found, whose errors are not in its"
         words += " own; how sure a change from or to it is, is not known"
-        warn(words, stacklevel=3)
+        warn(words, stacklevel=4)
+
+
+def compared(named, parameters=None):
+    """Return what calibrations say of the same parameters, `Compared`."""
     spaces = [full_covariance(calibration) for _, calibration in named]
     names = _common(named, spaces, parameters)
     axes = [space._axes() for space in spaces]
@@ -348,11 +373,8 @@ def _belongs(element, parameters):
 
 
 def _values(calibration, names):
-    elements = {}
-    for key, entry in calibration.parameter_values().items():
-        flat = np.ravel(entry["value"])
-        one = entry["value"].ndim == 0
-        elements |= {key: flat[0]} if one else {f"{key}[{i}]": v for i, v in enumerate(flat)}
+    free = free_of(calibration)
+    elements = dict(zip(free.names, free.start() / free.factors(), strict=True))
     # a parameter given per wavelength on a grid of one goes by its plain name
     return np.array([elements.get(n, elements.get(f"{n}[0]")) for n in names], dtype=float)
 
@@ -502,6 +524,7 @@ def courses(calibrations, parameters=None, *, events=()):
     priors = chances_of(dates, events, _CHANGE)
     rows = []
     for what in parameters or optics_of(named):
+        _check_independent(named)
         found = compared(named, [what])
         if not found.slopes.size:
             # nothing of it is determined

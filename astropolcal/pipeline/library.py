@@ -19,10 +19,11 @@ import stat
 import time
 from collections.abc import Iterable
 from contextlib import contextmanager, suppress
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import entry_points
-from itertools import islice
+from itertools import islice, pairwise
 from operator import attrgetter
 from pathlib import Path, PureWindowsPath
 
@@ -41,10 +42,13 @@ from astropolcal.calibration.result.calibration import (
     validity_of,
     with_validity,
 )
+from astropolcal.calibration.uncertainty.covariance import full_covariance
+from astropolcal.calibration.validation.targets import keep_sky_accuracy
 from astropolcal.converters.calibration import content_hash
 from astropolcal.converters.files import read_calibration, write_calibration
 from astropolcal.exceptions import CalibrationFileError, warn
 from astropolcal.files import atomic_path, check_kind, one_line
+from astropolcal.pipeline.headers import date_of
 from astropolcal.pipeline.store import contexts, export, freeze, frozen
 from astropolcal.version import version as our_version
 from astropolcal.words import check_type, listed
@@ -58,8 +62,10 @@ _MOST_BYTES = 16_384
 _SETTLED = 2_000_000_000
 _LONGEST_NAME, _LONGEST_SLUG, _MOST_SHOWN = 255, 60, 4
 _CHOSEN = "chosen: the newest that holds"
-# by more standard errors calibrations of the same optics differ
-_MOVED = 5.0
+# by more standard errors calibrations of the same optics differ, of which so many are compared
+_MOVED, _NEAREST = 5.0, 5
+# by how many differences: quantiles of Student's t, with which one error holds 68 of 100 cases
+_FEW = (1.84, 1.32, 1.20, 1.14)
 # what the index keeps of how good a calibration is
 _QUALITY = {"datasets": str, "s_res": float | None, "s_cv": float | None, "converged": bool}
 
@@ -325,33 +331,43 @@ class Library:
                 raise CalibrationFileError(_overlap(other, newest))
         return newest
 
-    def _warn_of_change(self, chosen):
-        """Warn where the calibrations before and after one differ by more than the errors."""
-        # what compares is not needed to choose
-        from astropolcal.calibration.result.comparison import moved
+    def _with_changes(self, chosen):
+        """Return an entry with what changes between calibrations in its covariance, and warn of it.
 
-        calibration, told = chosen.calibration, []
-        for other in self._beside(chosen):
-            optics = {}
-            if np.array_equal(other.calibration.wavelength, calibration.wavelength):
-                optics = moved(calibration, other.calibration)
-            by, most = optics.pop("", 0.0), max(optics, key=optics.get, default=None)
-            if by > _MOVED:
-                told.append(f"{other.name} by {by:.0f} ({most} by {optics[most]:.0f})")
-        if told:
-            warn(
-                f"{chosen.name} differs from {' and '.join(told)} standard errors: what changes "
-                "from one calibration to the next is not in the errors (astropolcal health says "
-                "what changed)",
-                stacklevel=3,
-            )
+        Each of the nearest in time is compared with the next. The mean square of the changes that
+        are beyond the errors of both is what a frame after one of them has to expect.
+        """
+        calibration, beside = chosen.calibration, self._beside(chosen)
+        same = [
+            e for e in beside if np.array_equal(e.calibration.wavelength, calibration.wavelength)
+        ]
+        changes = [_change(*pair) for pair in pairwise(same)]
+        told = [words for words, _ in changes if words]
+        if not told:
+            return chosen
+        warn(
+            f"{listed(told, most=2)} standard errors: what changes from one calibration to the "
+            f"next is among the errors of {chosen.name} (astropolcal health says what changed)",
+            stacklevel=3,
+        )
+        # samples of a posterior know of no other calibration
+        covariance = full_covariance(calibration)
+        shifts = [[shift.get(name, 0.0) for name in covariance.names] for _, shift in changes]
+        count = len(shifts)
+        covariance = covariance.beside(_FEW[count - 1] * np.array(shifts) / np.sqrt(count))
+        found = copy(chosen)
+        found._calibration = keep_sky_accuracy(
+            replace(calibration, covariance=covariance, fit=dict(calibration.fit), posterior=None)
+        )
+        return found
 
     def _beside(self, chosen):
-        """Return the entries before and after one, of the same instrument, mode and optics."""
+        """Return the entries nearest to one in time, of the same instrument, mode and optics."""
         kind = attrgetter("validity.instrument", "validity.mode", "validity.optics_in")
         same = sorted((e for e in self._in_force() if kind(e) == kind(chosen)), key=_start)
         k = [e.name for e in same].index(chosen.name)
-        return same[max(k - 1, 0) : k] + same[k + 1 : k + 2]
+        first = min(max(k - _NEAREST // 2, 0), max(len(same) - _NEAREST, 0))
+        return same[first : first + _NEAREST]
 
     def explain(self, instrument=None, *, mode=None, date=None, optics_in=None, beam=None):
         """
@@ -581,6 +597,35 @@ def _order(entry):
 
 def _start(entry):
     return (entry.validity.valid_from or "", str(entry.path))
+
+
+def _change(first, second):
+    """Say by how much a calibration differs from the next, if that is beyond the errors of both.
+
+    And return the difference of the parameters of optics that changed, but for those renewed
+    between the two, of which no frame after that has to expect as much again.
+    """
+    # what compares is not needed to choose
+    from astropolcal.pipeline.history import moved, shift
+
+    pair = first.calibration, second.calibration
+    known, days = known_instrument(pair[0].instrument), [date_of(one) or "" for one in pair]
+    renewed = {
+        optic
+        for optic, begin, end, _ in (known.changes if known else ())
+        if min(days) < end and max(days) >= begin
+    }
+    optics = {key: by for key, by in moved(*pair).items() if key not in renewed}
+    by = optics.pop("", 0.0)
+    if renewed:
+        # it may be all that differs
+        by = max(optics.values(), default=0.0)
+    if None in renewed or not by > _MOVED:
+        return "", {}
+    most = max(optics, key=optics.get)
+    own = [optic for optic in optics if optics[optic] > _MOVED] or [*optics]
+    words = f"{first.name} differs from {second.name} by {by:.0f} ({most} by {optics[most]:.0f})"
+    return words, {n: x for n, x in shift(*pair).items() if n.partition(".")[0] in own}
 
 
 def _of_instrument(entries, instrument):

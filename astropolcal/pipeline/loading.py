@@ -183,8 +183,9 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     Warns
     -----
     AstropolcalWarning
-        If the calibration is not usable as its verdict says, differs from the one before or after
-        it in the library by more than the errors of both, or is older than ``max_age``.
+        If the calibration is not usable as its verdict says, those beside it in the library differ
+        by more than their errors, which then count what changes between them, or it is older than
+        ``max_age``.
 
     Examples
     --------
@@ -215,7 +216,7 @@ def load(path, header=None, *, instrument=None, mode=None, date=None, optics_in=
     wanted = wanted_of(header, instrument, mode=mode, date=date, optics_in=optics_in)
     entry = library.find(**wanted)
     faults_of(entry.calibration, entry.name)
-    library._warn_of_change(entry)
+    entry = library._with_changes(entry)
     stated = {"instrument": instrument, "mode": mode, "date": date}
     stated = {key: value for key, value in stated.items() if value is not None}
     loaded = LoadedCalibration(entry, optics_in=optics_in, stated=stated, max_age=max_age)

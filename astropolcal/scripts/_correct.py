@@ -313,8 +313,8 @@ def choose_calibration(arguments, files):
     # what the user says goes before what headers tell
     beam = night.beam if arguments.optics_in is None else {}
     if calibration is None:
-        path = _of_library(path, arguments, night, beam, files)
-        calibration, digest = _read(path)
+        entry = _of_library(path, arguments, night, beam, files)
+        path, calibration, digest = entry.path, entry.calibration, entry.content_hash
     # --filter names the mode as the file does, whatever the headers call it
     mode = arguments.filter or night.mode
     moments = [(file, date, mode) for file, date in night.moments.items()]
@@ -345,7 +345,7 @@ def _library(path, changed):
 
 
 def _of_library(path, arguments, night, beam, files):
-    """Return the path of the calibration that holds for the first and the last frame."""
+    """Return the entry of the calibration that holds for the first and the last frame."""
     # None: the library chooses without a date
     dates = [None] if arguments.any_date else night.dates
     if not dates:
@@ -364,8 +364,7 @@ def _of_library(path, arguments, night, beam, files):
             f"{path}: the frames from {dates[0]} to {dates[-1]} need two calibrations, "
             f"{found[0].path} and {found[1].path}: correct them apart"
         )
-    library._warn_of_change(found[0])
-    return found[0].path
+    return library._with_changes(found[0])
 
 
 # ---- the product ----------------------------------------------------------------------------

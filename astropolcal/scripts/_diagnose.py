@@ -161,7 +161,7 @@ def _of_calibration(path, files, datasets, edits, arguments):
 
 def _since(earlier, fitted):
     """Return lines on how far parameters that are free moved from those of a calibration."""
-    from astropolcal.calibration.result.comparison import moved
+    from astropolcal.pipeline.history import moved
     from astropolcal.words import listed
 
     optics = moved(earlier, fitted)

@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import subprocess
 import sys
+import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -329,6 +330,41 @@ def test_what_is_wrong_with_a_calibration_is_told_as_by_correct(calibration, tmp
     library.add(bad, name="b.asdf", valid_from="2025-12-01")
     with pytest.warns(AstropolcalWarning, match=r"a.asdf differs from b.asdf by \d+ \(hwp by"):
         assert load(library, HEADER).path.name == "a.asdf"
+
+
+@pytest.mark.slow
+def test_what_changes_from_month_to_month_is_in_the_errors(tmp_path):
+    """The derotator scatters by 3 deg; its retardances are not determined alone."""
+    wanted = {"mode": "broadband JHK", "date": "2025-04-05"}
+    frames = half_wave_plate_cycles(derotator=[45, 62.5, 80, 100] * u.deg)
+    positions = {"hwp": [0, 22.5, 45, 67.5] * u.deg, "derotator": [50, 65, 80, 95] * u.deg}
+    for size in (0.0, 3.0):
+        folder = tmp_path / f"{size:g}"
+        folder.mkdir()
+        library = Library(folder)
+        nominal = CHARIS.chain("polarized", ["nbs"], wavelength=WAVELENGTH)
+        for month, shift in enumerate((0.0, size, -size / 2, size), start=1):
+            truth, date = nominal.copy(), {"date": f"2025-0{month}-05"}
+            truth["derotator"].horizontal.value += shift
+            if month == 4:
+                # no calibration is of that month
+                break
+            data = simulate(truth, WAVELENGTH, frames, seed=month, meta=meta("polarized") | date)
+            own = calibrate(nominal, data, instrument="charis", cross_validate=False)
+            library.add(own, valid_from=date["date"])
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            last = load(library, **wanted)
+        told = [str(one.message) for one in said if "differs from" in str(one.message)]
+        assert bool(told) == bool(size), told
+        assert all("(derotator by " in words and "among the errors" in words for words in told)
+        found = last.system_mueller(positions=positions, light="internal")
+        true = system_mueller(join(leaves(truth)[1:]), WAVELENGTH, positions)
+        error = np.sqrt(np.einsum("...ii->...i", found.covariance_in_gauge))
+        off = (found.value - true).reshape(error.shape)
+        # what nothing moves is neither wrong nor uncertain
+        pulls = (off / np.where(error > 1e-9, error, np.inf))[..., 1:4]
+        assert 0.2 < np.sqrt(np.mean(pulls[pulls != 0] ** 2)) < 2, size
 
 
 @pytest.mark.slow

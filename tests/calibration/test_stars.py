@@ -10,7 +10,7 @@ from astropy.table import QTable
 from star_data import CHARIS, WAVELENGTH, observe_star, star_chain
 
 from astropolcal import calibrate
-from astropolcal.calibration import fitted_stars, star_check
+from astropolcal.calibration import fitted_stars, star_check, target_accuracies
 from astropolcal.calibration.validation import paper_accuracies, star_accuracy, star_stokes
 from astropolcal.calibration.validation.cross_validation import standard_accuracy
 from astropolcal.chain import leaves, replace_optic
@@ -107,6 +107,35 @@ def test_a_star_that_is_not_as_the_catalogue_says_is_told_by_what_it_moves():
             assert against["moves"]["parameter"].startswith("m3.")
             assert told.reasons[0].startswith("star.q is ")
             assert "star's name" in told.advice
+
+
+@pytest.mark.slow
+def test_an_angle_that_moved_between_lamp_and_star_is_named_and_counts_in_the_errors():
+    grid, light = [1200, 1400, 1600, 1900, 2200] * u.nm, (30 * u.percent, None)
+    frames = half_wave_plate_cycles(derotator=[45, 57.5, 70, 82.5, 95, 107.5, 120] * u.deg)
+    source, nominal = (
+        CHARIS.chain("polarized", ["nbs"], wavelength=grid),
+        star_chain(wavelength=grid),
+    )
+    chains, errors = [source, nominal], []
+    lamp = simulate(source, grid, frames, flux=1e7, seed=3, meta={"source": "polarized"})
+    for move in (0.0, 2.0):
+        star = nominal.copy()
+        star["m3"].diattenuation = [0.017, 0.016, 0.015, 0.013, 0.012]
+        star["derotator"].theta.value += move
+        night = observe_star(star, 12, wavelength=grid, flux=1e7, seed=4)
+        cal = calibrate(chains, [lamp, night], search=False, cross_validate=False)
+        (accuracy,) = target_accuracies(cal, [light])
+        errors.append(np.median(accuracy["s_p"].value))
+        told, found = cal.verdict(), cal.fit["disagreements"]
+        assert told.usable, told
+        assert bool(found) == bool(move), found
+        if move:
+            assert found[0]["parameter"] == "derotator.theta"
+            assert abs(found[0]["change_deg"] - move) < 3 * found[0]["std_deg"]
+            assert "derotator.theta differs in star by" in told.words[0]
+            assert told.advice.endswith("--own derotator.theta gives each its own")
+    assert errors[1] > 5 * errors[0], errors
 
 
 def test_chain_without_a_star_is_an_error(simulated):

@@ -48,6 +48,7 @@ from astropolcal.calibration.noise.weighting import (
 )
 from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
 from astropolcal.calibration.uncertainty.covariance import covariance_around, errors_at_bounds
+from astropolcal.calibration.uncertainty.shared import between_datasets, disagreements
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
     cross_validated_residuals,
@@ -498,6 +499,9 @@ def _result(fitted, covariance=None):
     if np.isfinite(weighting.level):
         own, curved = _along_valleys(measurement, whitened, own, view)
         finding.near_null += curved
+    if covariance is None:
+        found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
+        own = between_datasets(own, found)
     stds = own.stds * measurement.free.factors()
     signs, errors_of_signs = undecided_signs(measurement, view, stds)
     finding.branches += signs

@@ -7,7 +7,6 @@ from astropy.table import QTable, vstack
 
 from astropolcal import instruments
 from astropolcal.calibration.identifiability.sky import known_instrument
-from astropolcal.calibration.system import free_of
 from astropolcal.calibration.uncertainty.derived import propagate
 from astropolcal.chain import join, leaves, stages, standing, system_mueller
 from astropolcal.efficiency import has_derotator, has_plate, polarimetric_efficiency, sky_path
@@ -96,35 +95,6 @@ def compare(members):
         if key.removesuffix("_std").endswith("_retardance"):
             table[key] = np.asarray(table[key]) * u.deg
     return table
-
-
-def moved(earlier, later):
-    """Return by how many standard errors the parameters of each optic differ, of all under "".
-
-    Those that both determine, by the covariances of both, beyond what is expected by chance: two
-    thicknesses of a plate may move by little each, and its retardance by much.
-    """
-    known = [one.covariance for one in (earlier, later)]
-    errors = [dict(zip(one.names, one.stds, strict=True)) for one in known]
-    # what is open has no error to compare with
-    names = [n for n in known[0].names if all(each.get(n, 0.0) > 0 for each in errors)]
-    if not names:
-        return {}
-    values, matrix = [], 0.0
-    for one, covariance in zip((earlier, later), known, strict=True):
-        rows, free = [covariance.names.index(name) for name in names], free_of(one)
-        plain = dict(zip(free.names, free.start() / free.factors(), strict=True))
-        values.append([plain[name] for name in names])
-        matrix = matrix + covariance.matrix[np.ix_(rows, rows)]
-    scale = np.sqrt(np.diag(matrix))
-    off, matrix = np.subtract(*values) / scale, matrix / np.outer(scale, scale)
-    optics = np.array([name.partition(".")[0] for name in names])
-    found = {}
-    for optic in ("", *dict.fromkeys(optics)):
-        mine = np.flatnonzero((optics == optic) | (optic == ""))
-        chi2 = off[mine] @ np.linalg.pinv(matrix[np.ix_(mine, mine)], hermitian=True) @ off[mine]
-        found[str(optic)] = float(np.sqrt(max(chi2 - mine.size, 0.0)))
-    return found
 
 
 def _resolved(label, member):

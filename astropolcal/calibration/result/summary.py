@@ -349,7 +349,7 @@ def to_dict(calibration, targets=TARGETS):
         "n_data": fit["n_data"],
         "n_free": len(calibration.covariance),
         "rank": calibration.identifiability.rank,
-        **{key: fit.get(key) or [] for key in ("lack_of_fit", "outliers")},
+        **{key: fit.get(key) or [] for key in ("lack_of_fit", "outliers", "disagreements")},
         "datasets": [
             _dataset(record) | {"masked": reasons}
             for record, reasons in zip(calibration.datasets, _masked(calibration), strict=True)

@@ -129,6 +129,7 @@ def verdict(calibration, targets=TARGETS):
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
+        cautions += _apart(calibration)
         if disagrees_with_priors(calibration):
             told = calibration.fit.get("against_prior")
             which = f": {told['parameter']} by {told['sigma']:.0f} sigma" if told else ""
@@ -293,6 +294,12 @@ def _of_one_table(calibration):
     names = [name for name, copies in own.items() if on_sky & {c.split(".")[0] for c in copies}]
     if names:
         yield f"on sky as in {calibration.datasets[seen].name}: own values of {', '.join(names)}"
+
+
+def _apart(calibration):
+    """Name the angle in which a dataset differs from the others most surely."""
+    words = "{parameter} differs in {dataset} by {change_deg:+.2g} deg ({sigma:.0f} sigma)"
+    return [words.format(**one) for one in (calibration.fit.get("disagreements") or [])[:1]]
 
 
 def _few(calibration):
@@ -464,6 +471,8 @@ def _next(calibration, free, wrong, sky):
     telescope = "counts as published, without error" if published else "is not in the model"
     unknown = any(_absurd(free)) or bool(sky)
     at_odds = calibration.fit.get("outliers") and calibration.settings.get("loss") == "linear"
+    moved = (calibration.fit.get("disagreements") or [{}])[0].get("parameter", "")
+    apart = f"did {moved} move between datasets? --own {moved} gives each its own" if moved else ""
     mask = "the frames at odds: mask them (mask_reason), or --loss bisquare"
     advice = (
         (_carried_off(calibration), mask),
@@ -478,6 +487,7 @@ def _next(calibration, free, wrong, sky):
         ("AoLP" in sky, f"a polarized standard star{_mount(calibration, free, sky)}"),
         (unknown or not calibration.converged, f"more angles of {listed(moved or ['the sky'])}"),
         (_excess(calibration) > _CLEARLY and at_odds, mask),
+        (apart, apart),
         ("star" in missing, f"an unpolarized standard star; the telescope {telescope}"),
         ("unpolarized" in missing, "the internal source without its polarizer"),
         (

@@ -166,20 +166,25 @@ class Covariance:
         """
         variances = np.diag(self.matrix).copy()
         steps = np.array([declared_step(unit) for unit in self.units])
-        rows, count = self.factor / steps, len(self.factor)
+        rows = []
         for i, way, beyond in sorted(directions, key=lambda one: -abs(one[1][one[0]])):
             # an element that is known exactly has no straight way, and rounding is no widening
             lacking = (way[i] ** 2 - variances[i]) / steps[i] ** 2
             if way[i] ** 2 > variances[i] * (1 + _ASYMMETRY) > 0:
-                more = _beyond(lacking, i, way / steps, beyond / steps)
-                rows = np.vstack([rows, *more])
-                variances += np.square(more * steps).sum(axis=0)
-        if len(rows) == count:
-            return self
-        _, sizes, right = np.linalg.svd(rows, full_matrices=False)
-        factor, matrix = sizes[:, None] * right * steps, np.full(self.matrix.shape, np.nan)
-        known = np.ix_(*(np.flatnonzero(np.isfinite(variances)),) * 2)
-        matrix[known] = (factor.T @ factor)[known]
+                more = steps * _beyond(lacking, i, way / steps, beyond / steps)
+                rows += [*more]
+                variances += np.square(more).sum(axis=0)
+        return self.beside(np.array(rows)) if rows else self
+
+    def beside(self, rows):
+        """Return the covariance with further changes of the parameters, one sigma each, (k, n)."""
+        # what has no error has none of them either
+        matrix, factor = self.matrix + rows.T @ rows, self.factor
+        if factor is not None:
+            steps = np.array([declared_step(unit) for unit in self.units])
+            whole = np.concatenate([factor, rows]) / steps
+            _, sizes, right = np.linalg.svd(whole, full_matrices=False)
+            factor = sizes[:, None] * right * steps
         return Covariance(self.names, self.units, matrix, factor=factor, null=self.null)
 
     def propagate(self, slopes):
