@@ -47,8 +47,12 @@ from astropolcal.calibration.noise.weighting import (
     robust_weighting,
 )
 from astropolcal.calibration.result.calibration import Calibration, DatasetRecord
-from astropolcal.calibration.uncertainty.covariance import covariance_around, errors_at_bounds
-from astropolcal.calibration.uncertainty.shared import between_datasets, disagreements
+from astropolcal.calibration.uncertainty.covariance import (
+    between_datasets,
+    covariance_around,
+    disagreements,
+    errors_at_bounds,
+)
 from astropolcal.calibration.validation.cross_validation import (
     accuracy_table,
     cross_validated_residuals,
