@@ -38,6 +38,7 @@ _TARGETS = 2
 _ONE_THING = {
     "course": " Both follow the same thing: they may be one that no table has.",
     "action": " Both are of one place and kind: they may be one thing with a course of its own.",
+    "optic": " Both are one optic, whose axes are oblique, or one cause of two laws.",
     "": "",
 }
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"

@@ -183,13 +183,21 @@ def _ordinal(number):
 
 
 def alike(cells):
-    """Return what two cells have in common: a "course" through the run, or an "action".
+    """Return what two cells have in common: an "optic", a "course" or an "action".
 
     That is place and kind. Both may be one thing that no table has; empty for all others.
     """
     if len(cells) != 2 or None in cells:
         return ""
-    one, other = cells
+    one, other = sorted(cells, key=lambda cell: cell.kind == "gain")
+    if one.dependence == other.dependence:
+        # what differs between the beams is a component, too, along the axes of what splits them
+        kind = "diattenuation_h" if other.kind == "gain" else other.kind
+        stem = one.kind.rpartition("_")[0]
+        beams = other.kind == "gain" and one.place.startswith("after:")
+        pair = {one.kind, kind} == {f"{stem}_h", f"{stem}_d"}
+        if (beams or one.place == other.place) and (pair or one.kind == other.kind):
+            return "optic"
     if one.dependence == other.dependence and not one.dependence.startswith(_NO_COURSE):
         return "course"
     return "action" if (one.place, one.kind) == (other.place, other.kind) else ""
