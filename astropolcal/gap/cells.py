@@ -29,11 +29,16 @@ _DETECTED = {
     "background": ("flux", "background in both beams"),
     "background_of_one_beam": ("flux", "background in one beam"),
     "nonlinearity": ("flux", "answer that is not linear"),
+    "nonlinearity_of_right_beam": ("flux", "answer of the right beam that is not linear"),
+    "nonlinearity_of_left_beam": ("flux", "answer of the left beam that is not linear"),
     "persistence": ("previous", "light of the frame before"),
     "crosstalk": ("constant", "light of one beam in the other"),
 }
 #: Kinds that only a detector may have, and the dependence of each.
 DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
+# of these some may also have a course through the run
+_VARIED = ("background", "background_of_one_beam")
+_COURSES = ("time", "step", "harmonic", "dataset")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
@@ -110,11 +115,17 @@ class Cell:
 
     def to_dict(self):
         """Return place, kind and dependence, ready for JSON."""
-        # what is a gain in words of two beams is one in those for machines
-        kind = "gain" if self.kind == "brightness" else self.kind
+        kind = _FOR_MACHINES.get(self.kind, self.kind)
         return {"place": self.place, "kind": kind, "dependence": self.dependence}
 
 
+# what has more words than kinds
+_FOR_MACHINES = {
+    "brightness": "gain",
+    "orientation": "rotation",
+    "nonlinearity_of_right_beam": "nonlinearity_of_one_beam",
+    "nonlinearity_of_left_beam": "nonlinearity_of_one_beam",
+}
 _KINDS = {
     "rotation": "rotation (circular retardance)",
     "diattenuation_c": "circular diattenuation",
@@ -126,6 +137,7 @@ _KINDS = {
     "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
+    "nonlinearity_of_one_beam": "answer of one beam that is not linear",
     **{kind: words for kind, (_, words) in _DETECTED.items()},
 }
 
@@ -185,7 +197,9 @@ def _ordinal(number):
 def alike(cells):
     """Return what two cells have in common: an "optic", a "course" or an "action".
 
-    That is place and kind. Both may be one thing that no table has; empty for all others.
+    An optic of any axis has two components, and a cell may be asked for twice, with another law. A
+    course through the run, or an action, which is place and kind, may be one thing that no table
+    has; empty for all others.
     """
     if len(cells) != 2 or None in cells:
         return ""
@@ -350,7 +364,9 @@ class Probes:
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""
         if kind in DETECTED:
-            return [DETECTED[kind], *(name for name in self.waves if name[:8] == "dataset:")]
+            allowed = _COURSES if kind in _VARIED else ("dataset",)
+            more = (n for n in self.waves if split_run(n)[0].partition(":")[0] in allowed)
+            return [DETECTED[kind], *more]
         if len(self.slopes[place, kind]) > 1:
             return list(self.waves)
         # a place in one chain only is in that run anyway
@@ -511,10 +527,13 @@ class Probes:
         before[..., order[1:]] = fluxes[..., order[:-1]]
         afterglow = np.divide(before, fluxes, out=np.zeros_like(fluxes), where=fluxes > 0)
         half = (left - right) / 2
+        bent = right * fluxes[0] / usual, left * fluxes[1] / usual
         changes = {
             "background": (added, added),
             "background_of_one_beam": (added, 0 * added),
-            "nonlinearity": (right * fluxes[0] / usual, left * fluxes[1] / usual),
+            "nonlinearity": bent,
+            "nonlinearity_of_right_beam": (bent[0], 0 * left),
+            "nonlinearity_of_left_beam": (0 * right, bent[1]),
             "persistence": (right * afterglow[0], left * afterglow[1]),
             "crosstalk": (half, -half),
         }
