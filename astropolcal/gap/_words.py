@@ -187,17 +187,22 @@ def has_sizes(entry):
 # ---- what a cause is, and what else it may be ----------------------------------------------------
 
 
+def _cell(one):
+    """Return the cell of what has no name; machines know fewer kinds."""
+    return Cell(*one["name"].split("/", 2))
+
+
 def _outline(one):
     """Return kind and dependence of a cell, the name of what has one."""
-    cell = None if one["effect"] else one["cell"]
-    return (cell["kind"], cell["dependence"]) if cell else one["name"]
+    cell = None if one["effect"] or not one["cell"] else _cell(one)
+    return (cell.kind, cell.dependence) if cell else one["name"]
 
 
 def _title(group):
     """Return the title of cells of one outline, with all their places."""
     if len(group) == 1:
         return group[0]["title"]
-    cell = Cell(**group[0]["cell"])
+    cell = _cell(group[0])
     return f"{_kind_words(cell)} {_places(group, 'of')}{_when(cell.dependence)}"
 
 
@@ -254,7 +259,7 @@ def _found(entry):
         return f"The model lacks one of several things ({chance}): {several}."
     if entry["effect"] or not entry["cell"]:
         return f"The model lacks one effect: {entry['title']} ({chance})."
-    cell, places = Cell(**entry["cell"]), _places(_alike(entry), "in")
+    cell, places = _cell(entry), _places(_alike(entry), "in")
     begin = "The detector shows" if cell.place == "detector" else f"Something {places} causes"
     begin = "The data show another" if cell.kind == "brightness" else begin
     words = f"{_kind_words(cell)}{_when(cell.dependence)}"

@@ -53,7 +53,7 @@ FINITE = 0.1
 # or a share): beyond it is no perturbation
 _SIZES = {
     "retardance": (0.1, np.pi),
-    "rotation": (0.02, np.pi / 4),
+    **dict.fromkeys(("rotation", "orientation"), (0.02, np.pi / 4)),
     "diattenuation": (0.02, 3.0),
     "depolarization": (0.05, 3.0),
     # what follows the flux would follow the flicker of the lamp as well if it could be large
@@ -128,6 +128,7 @@ _FOR_MACHINES = {
 }
 _KINDS = {
     "rotation": "rotation (circular retardance)",
+    "orientation": "error of the angle",
     "diattenuation_c": "circular diattenuation",
     "depolarization_linear": "depolarization of linear light",
     "depolarization_h": "depolarization along one axis against the other",
@@ -447,7 +448,10 @@ class Probes:
         """Return the derivative of both channels to a constant perturbation, by place and kind."""
         chains, where = [], {}
         for chain in self.model.held_chains:
-            for place in places(chain):
+            found = places(chain)
+            # what turns an optic turns the light in front of it and back behind it
+            turning = [one.after for one in found if one.name.startswith("in:")]
+            for place in [*found, *(Place(f"{_FRONT}{name}", before=name) for name in turning)]:
                 frame = {"theta": place.theta * u.rad, "mount": place.mount}
                 held = {"fixed": {"theta": True, "retardance": True}}
                 name = _PROBE + place.name
@@ -466,6 +470,12 @@ class Probes:
             own = {p: names[_PROBE + p] for p in where if _PROBE + p in names}
             both = [sweep.crossings(own.values(), w) for w in channel.slopes(sweep)]
             for place, j in own.items():
+                if place.startswith(_FRONT):
+                    inside = "in:" + place.removeprefix(_FRONT)
+                    slope = np.stack([_bilinear(*p[j], GENERATORS["rotation"]) for p in both])
+                    slope = slope * channel.valid - found[inside, "rotation"][i]
+                    found.setdefault((inside, "orientation"), {})[i] = slope
+                    continue
                 for kind, generator in GENERATORS.items():
                     if kind == "gain":
                         continue
@@ -547,7 +557,7 @@ def _frames_first(basis, shape):
     return np.ascontiguousarray(basis.reshape(rows, shape[-1], basis.shape[1]).swapaxes(0, 1))
 
 
-_PROBE = "gap_probe_"
+_PROBE, _FRONT = "gap_probe_", "front:"
 
 
 def _bilinear(row, light, generator):
