@@ -51,8 +51,6 @@ _AMPLITUDES = {
     "direction": "change after moves backwards",
     "move": "change with a move of one radian",
 }
-# what the coefficients of the law of such a course are
-_COEFFICIENTS = {"c1": "amplitude", "amplitude_0": "amplitude", "amplitude_1": "quadrature"}
 # what the parameter "right" is of what a detector does, by the kind of its cell: no sum tells a
 # background of one beam from the lamp
 _BEAMS = dict.fromkeys(("nonlinearity", "persistence"), "both beams")
@@ -138,9 +136,8 @@ def labels(entry):
         known = {"amplitude": _AMPLITUDES.get(kind, "size"), "quadrature": "amplitude of the sine"}
         known = {key: words + of for key, words in known.items()}
         known |= {"right": _BEAMS.get(entry["cell"]["kind"])}
-        # what follows a course is named after what it is and its law
-        rests = {key: key.partition("_")[2] for _, key in keys}
-        known |= {key: known.get(_COEFFICIENTS.get(r, r)) for key, r in rests.items() if r}
+        # of what follows a course the coefficient of its law is free
+        known |= {key: known["amplitude"] for _, key in keys if key.endswith(("_c1", "_amplitude"))}
     words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
     return [one.replace("_", " ") for one in words]
 

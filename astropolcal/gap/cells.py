@@ -36,9 +36,10 @@ _DETECTED = {
 }
 #: Kinds that only a detector may have, and the dependence of each.
 DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
-# of these some may also have a course through the run
-_VARIED = ("background", "background_of_one_beam")
-_COURSES = ("time", "step", "harmonic", "dataset")
+# of these some may also drift or step; an angle may do that, too, and what follows a stage has a
+# name
+_COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step"))
+_COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
@@ -364,14 +365,16 @@ class Probes:
 
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""
+        names = list(self.waves)
+        if kind in DETECTED or kind in _COURSES:
+            allowed = (*_COURSES.get(kind, ()), "dataset")
+            names = [name for name in names if split_run(name)[0].partition(":")[0] in allowed]
         if kind in DETECTED:
-            allowed = _COURSES if kind in _VARIED else ("dataset",)
-            more = (n for n in self.waves if split_run(n)[0].partition(":")[0] in allowed)
-            return [DETECTED[kind], *more]
+            return [DETECTED[kind], *names]
         if len(self.slopes[place, kind]) > 1:
-            return list(self.waves)
+            return names
         # a place in one chain only is in that run anyway
-        return [name for name in self.waves if split_run(name)[1] is None]
+        return [name for name in names if split_run(name)[1] is None]
 
     @property
     def runs(self):

@@ -746,23 +746,17 @@ def _with_course(optic, key, text):
     """Return an optic of which a parameter follows a dependence, and what of it is free."""
     what, *parts = text.split(":")
     if what == "time":
-        model, free = models.Legendre1D(1, domain=(0, 1)), ("c1",)
+        model, free = models.Legendre1D(1, domain=(0, 1)), "c1"
     elif what == "step":
         # from half a frame before on
-        width = 2 * _LONG
-        model = models.Box1D(amplitude=0, x_0=int(parts[0]) - 0.5 + width / 2, width=width)
-        free = ("amplitude",)
-    elif what == "harmonic":
-        # of angles in degree
-        rate = {"amplitude": 0, "frequency": int(parts[1]) / 360}
-        model = models.Cosine1D(**rate) + models.Sine1D(**rate)
-        free = ("amplitude_0", "amplitude_1")
+        middle = int(parts[0]) - 0.5 + _LONG
+        model, free = models.Box1D(amplitude=0, x_0=middle, width=2 * _LONG), "amplitude"
     else:
         return optic, (key,)
     optic = optic.copy()
     law, found = law_of(key, getattr(optic, key).unit, model, Dependence(text).driver)
     optic._follow(key, law, found.values())
-    return optic, tuple(f"{key}_{name}" for name in free)
+    return optic, (f"{key}_{free}",)
 
 
 class CellEffect(Effect):
