@@ -47,7 +47,11 @@ _TRIES = 14
 #: What optics can do to a Stokes vector, to first order.
 ACTIONS = {kind: matrix for kind, matrix in GENERATORS.items() if kind != "gain"}
 #: What a detector does, and the dependence under which the key has it; a gain may have any.
-DETECTOR = {kind: on for kind, on in DETECTED.items() if kind != "crosstalk"}
+DETECTOR = {
+    kind: on
+    for kind, on in DETECTED.items()
+    if kind != "crosstalk" and not kind.startswith("nonlinearity_")
+}
 _FRAME_FAULTS = ("hwp angle", "derotator angle", "exchanged", "one beam")
 _MECHANISMS = (
     "smear", "ghost", "hysteresis", "wander", "jitter", "fringes", "course", "stray light",

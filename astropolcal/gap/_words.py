@@ -38,6 +38,7 @@ _TARGETS = 2
 _ONE_THING = {
     "course": " Both follow the same thing: they may be one that no table has.",
     "action": " Both are of one place and kind: they may be one thing with a course of its own.",
+    "optic": " Both are one optic, whose axes are oblique, or one cause of two laws.",
     "": "",
 }
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -135,6 +136,8 @@ def labels(entry):
         known = {"amplitude": _AMPLITUDES.get(kind, "size"), "quadrature": "amplitude of the sine"}
         known = {key: words + of for key, words in known.items()}
         known |= {"right": _BEAMS.get(entry["cell"]["kind"])}
+        # of what follows a course the coefficient of its law is free
+        known |= {key: known["amplitude"] for _, key in keys if key.endswith(("_c1", "_amplitude"))}
     words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
     return [one.replace("_", " ") for one in words]
 
@@ -181,17 +184,22 @@ def has_sizes(entry):
 # ---- what a cause is, and what else it may be ----------------------------------------------------
 
 
+def _cell(one):
+    """Return the cell of what has no name; machines know fewer kinds."""
+    return Cell(*one["name"].split("/", 2))
+
+
 def _outline(one):
     """Return kind and dependence of a cell, the name of what has one."""
-    cell = None if one["effect"] else one["cell"]
-    return (cell["kind"], cell["dependence"]) if cell else one["name"]
+    cell = None if one["effect"] or not one["cell"] else _cell(one)
+    return (cell.kind, cell.dependence) if cell else one["name"]
 
 
 def _title(group):
     """Return the title of cells of one outline, with all their places."""
     if len(group) == 1:
         return group[0]["title"]
-    cell = Cell(**group[0]["cell"])
+    cell = _cell(group[0])
     return f"{_kind_words(cell)} {_places(group, 'of')}{_when(cell.dependence)}"
 
 
@@ -248,7 +256,7 @@ def _found(entry):
         return f"The model lacks one of several things ({chance}): {several}."
     if entry["effect"] or not entry["cell"]:
         return f"The model lacks one effect: {entry['title']} ({chance})."
-    cell, places = Cell(**entry["cell"]), _places(_alike(entry), "in")
+    cell, places = _cell(entry), _places(_alike(entry), "in")
     begin = "The detector shows" if cell.place == "detector" else f"Something {places} causes"
     begin = "The data show another" if cell.kind == "brightness" else begin
     words = f"{_kind_words(cell)}{_when(cell.dependence)}"

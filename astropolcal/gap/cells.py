@@ -29,11 +29,17 @@ _DETECTED = {
     "background": ("flux", "background in both beams"),
     "background_of_one_beam": ("flux", "background in one beam"),
     "nonlinearity": ("flux", "answer that is not linear"),
+    "nonlinearity_of_right_beam": ("flux", "answer of the right beam that is not linear"),
+    "nonlinearity_of_left_beam": ("flux", "answer of the left beam that is not linear"),
     "persistence": ("previous", "light of the frame before"),
     "crosstalk": ("constant", "light of one beam in the other"),
 }
 #: Kinds that only a detector may have, and the dependence of each.
 DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
+# of these some may also drift or step; an angle may do that, too, and what follows a stage has a
+# name
+_COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step"))
+_COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
@@ -48,7 +54,7 @@ FINITE = 0.1
 # or a share): beyond it is no perturbation
 _SIZES = {
     "retardance": (0.1, np.pi),
-    "rotation": (0.02, np.pi / 4),
+    **dict.fromkeys(("rotation", "orientation"), (0.02, np.pi / 4)),
     "diattenuation": (0.02, 3.0),
     "depolarization": (0.05, 3.0),
     # what follows the flux would follow the flicker of the lamp as well if it could be large
@@ -110,13 +116,20 @@ class Cell:
 
     def to_dict(self):
         """Return place, kind and dependence, ready for JSON."""
-        # what is a gain in words of two beams is one in those for machines
-        kind = "gain" if self.kind == "brightness" else self.kind
+        kind = _FOR_MACHINES.get(self.kind, self.kind)
         return {"place": self.place, "kind": kind, "dependence": self.dependence}
 
 
+# what has more words than kinds
+_FOR_MACHINES = {
+    "brightness": "gain",
+    "orientation": "rotation",
+    "nonlinearity_of_right_beam": "nonlinearity_of_one_beam",
+    "nonlinearity_of_left_beam": "nonlinearity_of_one_beam",
+}
 _KINDS = {
     "rotation": "rotation (circular retardance)",
+    "orientation": "error of the angle",
     "diattenuation_c": "circular diattenuation",
     "depolarization_linear": "depolarization of linear light",
     "depolarization_h": "depolarization along one axis against the other",
@@ -126,6 +139,7 @@ _KINDS = {
     "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
+    "nonlinearity_of_one_beam": "answer of one beam that is not linear",
     **{kind: words for kind, (_, words) in _DETECTED.items()},
 }
 
@@ -183,13 +197,23 @@ def _ordinal(number):
 
 
 def alike(cells):
-    """Return what two cells have in common: a "course" through the run, or an "action".
+    """Return what two cells have in common: an "optic", a "course" or an "action".
 
-    That is place and kind. Both may be one thing that no table has; empty for all others.
+    An optic of any axis has two components, and a cell may be asked for twice, with another law. A
+    course through the run, or an action, which is place and kind, may be one thing that no table
+    has; empty for all others.
     """
     if len(cells) != 2 or None in cells:
         return ""
-    one, other = cells
+    one, other = sorted(cells, key=lambda cell: cell.kind == "gain")
+    if one.dependence == other.dependence:
+        # what differs between the beams is a component, too, along the axes of what splits them
+        kind = "diattenuation_h" if other.kind == "gain" else other.kind
+        stem = one.kind.rpartition("_")[0]
+        beams = other.kind == "gain" and one.place.startswith("after:")
+        pair = {one.kind, kind} == {f"{stem}_h", f"{stem}_d"}
+        if (beams or one.place == other.place) and (pair or one.kind == other.kind):
+            return "optic"
     if one.dependence == other.dependence and not one.dependence.startswith(_NO_COURSE):
         return "course"
     return "action" if (one.place, one.kind) == (other.place, other.kind) else ""
@@ -341,12 +365,16 @@ class Probes:
 
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""
+        names = list(self.waves)
+        if kind in DETECTED or kind in _COURSES:
+            allowed = (*_COURSES.get(kind, ()), "dataset")
+            names = [name for name in names if split_run(name)[0].partition(":")[0] in allowed]
         if kind in DETECTED:
-            return [DETECTED[kind], *(name for name in self.waves if name[:8] == "dataset:")]
+            return [DETECTED[kind], *names]
         if len(self.slopes[place, kind]) > 1:
-            return list(self.waves)
+            return names
         # a place in one chain only is in that run anyway
-        return [name for name in self.waves if split_run(name)[1] is None]
+        return [name for name in names if split_run(name)[1] is None]
 
     @property
     def runs(self):
@@ -423,7 +451,10 @@ class Probes:
         """Return the derivative of both channels to a constant perturbation, by place and kind."""
         chains, where = [], {}
         for chain in self.model.held_chains:
-            for place in places(chain):
+            found = places(chain)
+            # what turns an optic turns the light in front of it and back behind it
+            turning = [one.after for one in found if one.name.startswith("in:")]
+            for place in [*found, *(Place(f"{_FRONT}{name}", before=name) for name in turning)]:
                 frame = {"theta": place.theta * u.rad, "mount": place.mount}
                 held = {"fixed": {"theta": True, "retardance": True}}
                 name = _PROBE + place.name
@@ -442,6 +473,12 @@ class Probes:
             own = {p: names[_PROBE + p] for p in where if _PROBE + p in names}
             both = [sweep.crossings(own.values(), w) for w in channel.slopes(sweep)]
             for place, j in own.items():
+                if place.startswith(_FRONT):
+                    inside = "in:" + place.removeprefix(_FRONT)
+                    slope = np.stack([_bilinear(*p[j], GENERATORS["rotation"]) for p in both])
+                    slope = slope * channel.valid - found[inside, "rotation"][i]
+                    found.setdefault((inside, "orientation"), {})[i] = slope
+                    continue
                 for kind, generator in GENERATORS.items():
                     if kind == "gain":
                         continue
@@ -503,10 +540,13 @@ class Probes:
         before[..., order[1:]] = fluxes[..., order[:-1]]
         afterglow = np.divide(before, fluxes, out=np.zeros_like(fluxes), where=fluxes > 0)
         half = (left - right) / 2
+        bent = right * fluxes[0] / usual, left * fluxes[1] / usual
         changes = {
             "background": (added, added),
             "background_of_one_beam": (added, 0 * added),
-            "nonlinearity": (right * fluxes[0] / usual, left * fluxes[1] / usual),
+            "nonlinearity": bent,
+            "nonlinearity_of_right_beam": (bent[0], 0 * left),
+            "nonlinearity_of_left_beam": (0 * right, bent[1]),
             "persistence": (right * afterglow[0], left * afterglow[1]),
             "crosstalk": (half, -half),
         }
@@ -520,7 +560,7 @@ def _frames_first(basis, shape):
     return np.ascontiguousarray(basis.reshape(rows, shape[-1], basis.shape[1]).swapaxes(0, 1))
 
 
-_PROBE = "gap_probe_"
+_PROBE, _FRONT = "gap_probe_", "front:"
 
 
 def _bilinear(row, light, generator):

@@ -88,7 +88,7 @@ _BETTER_COURSE, _BETTER = 0.85, -0.7
 # and where two causes have the same course, or the same place and kind: of such causes given to
 # mechanisms with 0.8 or more 2 of 16 and 2 of 10 were right (4 of 10 if any law counts); of 229
 # answers to pairs none was of the first sort, and all six of the second were right
-_ALIKE_CAUSES = {"course": 0.85, "action": 0.5, "": 0.0}
+_ALIKE_CAUSES = {"course": 0.85, "action": 0.5, "optic": 0.0, "": 0.0}
 # from this probability on it is told
 _MAY_BE = 0.3
 # the same where one of several causes is not asked for in every part of the data: 23 of 52
@@ -228,7 +228,8 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     task.say("one perturbation of any course")
     rivals = _real_courses(best.model, base)
     # what changed between runs has two causes, and one course in all of them: that is no evidence
-    of_several = _ONE_COURSE * (runs < 2 and len(best.chosen) > 1)
+    is_one = alike([one.cell for one in best.chosen]) == "optic"
+    of_several = _ONE_COURSE * (runs < 2 and len(best.chosen) > 1 and not is_one)
     behind = np.array([one.behind for one in rivals])
     chances = np.maximum(
         _BETTER_COURSE * expit(3 * (_BETTER - behind)), of_several * expit(_AS_WELL - behind)

@@ -121,13 +121,19 @@ class Setup:
         found.remove_columns([stage for stage in extra if stage != "frame"])
         return type(data).from_table(found, name=data.name)
 
-    def with_detector(self, kind, size, **options):
-        """Simulate a detector that has an error of a kind."""
+    def with_detector(self, kind, size, course=1.0, **options):
+        """Simulate a detector that has an error of a kind, perhaps with a course through the run.
+
+        That is a function of the table of the frames.
+        """
         data = self.observed(**options)
         right, left = data.flux_right, data.flux_left
         usual = np.median([right, left])
+        size = size * (course(data.frames)[:, None] if callable(course) else course)
         if kind == "nonlinearity":
             changed = [flux * (1 + size * flux / usual) for flux in (right, left)]
+        elif kind == "nonlinearity_of_right_beam":
+            changed = [right * (1 + size * right / usual), left]
         elif kind == "persistence":
             changed = [flux + size * np.roll(flux, 1, axis=0) for flux in (right, left)]
         elif kind == "crosstalk":

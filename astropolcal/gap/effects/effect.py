@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
+from astropy.modeling import models
 
 from astropolcal import instruments, optics
 from astropolcal.chain import Train, insert_optic
@@ -23,6 +24,7 @@ from astropolcal.gap.effects.where import SEVERAL, Roles, Where
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
 from astropolcal.observations.pointings import TRACKING
+from astropolcal.optics.laws import law_of
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.units import canonical_factor, to_unit
 from astropolcal.words import check_choice, check_type, did_you_mean, is_whole
@@ -41,6 +43,8 @@ _SEVERAL = {
 }
 #: Degree of what is one number for all wavelengths, and no law.
 NUMBER = "number"
+# more frames than any run has
+_LONG = 1e6
 # largest change of an optic's Mueller matrix from the identity that is none
 _SAME = 1e-9
 _SETTINGS = (
@@ -724,6 +728,10 @@ DETECTOR = {
         *(optics.FluxGain(power=1, mount="flux"), "right"),
         {"flux": 1, "equal": {"left": "right"}},
     ),
+    **{
+        f"nonlinearity_of_{beam}_beam": (optics.FluxGain(power=1, mount="flux"), beam, {"flux": 1})
+        for beam in ("right", "left")
+    },
     # the gain of a beam grows as the flux before over the flux now
     "persistence": (
         *(optics.FluxGain(power=-1, mount="previous_flux"), "right"),
@@ -732,6 +740,23 @@ DETECTOR = {
     "crosstalk": (optics.Perturbation(kind="depolarization_linear"), "amplitude", {}),
 }
 _IN_FRONT = ("background", "crosstalk")
+
+
+def _with_course(optic, key, text):
+    """Return an optic of which a parameter follows a dependence, and what of it is free."""
+    what, *parts = text.split(":")
+    if what == "time":
+        model, free = models.Legendre1D(1, domain=(0, 1)), "c1"
+    elif what == "step":
+        # from half a frame before on
+        middle = int(parts[0]) - 0.5 + _LONG
+        model, free = models.Box1D(amplitude=0, x_0=middle, width=2 * _LONG), "amplitude"
+    else:
+        return optic, (key,)
+    optic = optic.copy()
+    law, found = law_of(key, getattr(optic, key).unit, model, Dependence(text).driver)
+    optic._follow(key, law, found.values())
+    return optic, (f"{key}_{free}",)
 
 
 class CellEffect(Effect):
@@ -745,7 +770,8 @@ class CellEffect(Effect):
         if cell.kind in DETECTOR:
             optic, free, more = DETECTOR[cell.kind]
             sizes = {"scale": cell.scale, "limit": cell.limit}
-            settings |= {"inserted": optic, "free": (free,)} | sizes | more
+            optic, free = _with_course(optic, free, split_run(dependence)[0])
+            settings |= {"inserted": optic, "free": free} | sizes | more
             dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))
