@@ -124,8 +124,8 @@ class Cell:
 _FOR_MACHINES = {
     "brightness": "gain",
     "orientation": "rotation",
-    "nonlinearity_of_right_beam": "nonlinearity_of_one_beam",
-    "nonlinearity_of_left_beam": "nonlinearity_of_one_beam",
+    "nonlinearity_of_right_beam": "nonlinearity",
+    "nonlinearity_of_left_beam": "nonlinearity",
 }
 _KINDS = {
     "rotation": "rotation (circular retardance)",
@@ -139,7 +139,6 @@ _KINDS = {
     "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
-    "nonlinearity_of_one_beam": "answer of one beam that is not linear",
     **{kind: words for kind, (_, words) in _DETECTED.items()},
 }
 

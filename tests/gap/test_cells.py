@@ -175,7 +175,7 @@ def test_every_cell_has_a_name_and_words_of_its_own():
         again = Cell(**json.loads(json.dumps(cell.to_dict())))
         # to machines an optic that is turned is a rotation in its frame, as to the names of those
         if cell.kind in ("orientation", "nonlinearity_of_right_beam", "nonlinearity_of_left_beam"):
-            assert again.kind in ("rotation", "nonlinearity_of_one_beam")
+            assert again.kind in ("rotation", "nonlinearity")
             assert again.title
         else:
             assert (again, again.name) == (cell, cell.name)
