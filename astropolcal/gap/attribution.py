@@ -390,33 +390,20 @@ def _named(probes, effects, temper, degree="default", others=()):
     fitting, others = ([*filter(fits, some)] for some in (effects, others))
     law = replace(model.context, degree=degree)
     for effect in fitting:
-        effect, is_in = _as_in(model, effect), effect.name in model.added
-        spectrum, lean = None if is_in else _bent_name(probes, effect, law), None
+        spectrum = _bent_name(probes, effect, law) if effect.name not in model.added else None
         if spectrum is None:
             slopes = _slopes_of(probes, effect, [*fitting, *others], degree)
             spectrum = _spectrum_of(probes, slopes)
-            if spectrum is not None and effect.spare and not is_in:
-                # all its parameters follow one law
-                lean = effect.without_spare()
-                part = slopes.shape[1] * len(lean.free) // len(effect.free)
-                lean = lean, _spectrum_of(probes, slopes[:, :part])
-        context = None if degree == "default" else law
-        both = [one for one in ((effect, spectrum), lean) if one and one[1] is not None]
-        both = [_with_name(one, model, *told, temper, context) for one, told in both]
-        found += sorted(both, key=preference)[:1]
+        if spectrum is not None:
+            context = None if degree == "default" else law
+            found.append(_with_name(effect, model, *spectrum, temper, context))
     return found
-
-
-def _as_in(model, effect):
-    """Return an effect as a model has it: perhaps without what it may do without."""
-    keys = [p.name.partition(".")[2] for p in model.added.get(effect.name, ())]
-    return effect.without_spare() if keys and effect.spare not in (None, *keys) else effect
 
 
 def _columns(model, effects, degree):
     """Return the derivatives to named effects, all at zero in the same chains, by name."""
     known = model.__dict__.setdefault("_named_columns", {})
-    asked = {(e.name, e.free): e for e in effects if e.name not in model.added}
+    asked = {e.name: e for e in effects if e.name not in model.added}
     waiting = [effect for name, effect in asked.items() if (name, degree) not in known]
     context = replace(model.context, degree=degree)
     while waiting:
@@ -432,7 +419,7 @@ def _columns(model, effects, degree):
             if blocked or names & taken or len(parameters) == _TOGETHER:
                 later.append(effect)
                 continue
-            edited, parameters[effect.name, effect.free] = edit.chains, edit.parameters
+            edited, parameters[effect.name] = edit.chains, edit.parameters
             ties |= {name: tie for name, tie in edit.ties.items() if tie.source in names}
             laws, neutral = laws | edit.laws, neutral | edit.neutral
         how = {"ties": ties, "laws": laws, "neutral": neutral, "like": model.problem}
@@ -461,7 +448,7 @@ def _slopes_of(probes, effect, effects, degree):
     model = probes.model
     if effect.name in model.added:
         return _columns_of(model.problem, model.jacobian, model.added[effect.name])
-    return _columns(model, effects, degree).get((effect.name, effect.free))
+    return _columns(model, effects, degree).get(effect.name)
 
 
 def _spectrum_of(probes, slopes):

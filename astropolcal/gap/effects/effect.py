@@ -49,7 +49,7 @@ _LONG = 1e6
 _SAME = 1e-9
 _SETTINGS = (
     *("name", "title", "where", "dependence", "scale", "limit", "shows", "reference", "words"),
-    *("category", "inserted", "free", "spare", "equal", "when", "near", "absorbed_by", "flux"),
+    *("category", "inserted", "free", "equal", "when", "near", "absorbed_by", "flux"),
     *("change", "back"),
 )
 
@@ -271,8 +271,6 @@ class Effect:
         The optic that it inserts, or what makes it of the optic at its place.
     free : tuple of str
         Parameters of that optic that it frees, by default those that are free.
-    spare : str
-        The last of them, if the effect may do without it.
     equal : dict
         Parameters of the inserted optic that follow another one.
     when : callable
@@ -302,7 +300,7 @@ class Effect:
     name = title = place = where = optic = inserted = near = absorbed_by = scale = limit = None
     kind, kinds, dependence, degree = "optic", (), "constant", 2
     shows, reference = "what a perturbation at its place does", "declared by its user"
-    free, spare, equal = None, None, {}
+    free, equal = None, {}
     #: Flux at which a coefficient counts, in units of the usual flux of a beam.
     flux = None
     #: Whether it is an error of the orientation of its optic: undone behind it.
@@ -446,10 +444,6 @@ class Effect:
         for key, value in attributes.items():
             setattr(new, key, value)
         return new
-
-    def without_spare(self):
-        """Return the effect without the parameter that it may do without."""
-        return self.changed(free=tuple(k for k in self.free if k != self.spare), spare=None)
 
     def at(self, optic):
         """Return the effect of one optic of its kind, with the name ``"effect:optic"``."""

@@ -202,8 +202,7 @@ _RELAY_EFFECTS = [
     # beyond half a turn a retardance comes back with the other sign
     _effect("static_retarder", "retarder that is static downstream of the derotator",
         _STATIC, (*_RETARDANCE, "rotation"), optics.EllipticalRetarder(), (*_ANY_AXIS, "circular"),
-        _size(2, 180, u.deg), "pattern in derotator angle, smooth in wavelength", _HARRINGTON_2019,
-        spare="circular"),
+        _size(2, 180, u.deg), "pattern in derotator angle, smooth in wavelength", _HARRINGTON_2019),
     _effect("dichroic_j_band", "retardance of a dichroic that changes steeply with wavelength",
         _RELAY, _RETARDANCE, optics.EllipticalRetarder(), _ANY_AXIS, _size(5, 360, u.deg),
         "pattern in derotator angle, sharp in wavelength", _HARRINGTON_2019,
