@@ -23,8 +23,8 @@ from astropolcal.optics.perturbations import split_run
 
 __all__ = []
 
-# sizes of the prior, in units of the usual one
-_SIZES = (0.1, 1.0, 10.0)
+# sizes of the prior, in units of the usual one: bright sources show what is far smaller
+_SIZES = (0.01, 0.1, 1.0, 10.0)
 # laws in wavelength of a cell: one number, or a smooth curve; for the best cells more freedom,
 # None for one value per wavelength
 _DEGREES, _FREER = (0, 2), (4, None)
