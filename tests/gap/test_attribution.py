@@ -45,14 +45,14 @@ def marginal(columns, target, size, temper):
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1.0, 4.0]))
 def test_evidence_is_the_marginal_likelihood(seed, temper):
-    """Averaged over three sizes of the prior: a tenth of the usual one, that, and ten times it."""
+    """Averaged over four sizes of the prior, from a hundredth of the usual one to ten times it."""
     rng = np.random.default_rng(seed)
     columns, target = rng.normal(size=(6, 2)) / 3, 2 * rng.normal(size=6)
     values, vectors = np.linalg.eigh(columns.T @ columns)
     share = (vectors.T @ columns.T @ target) ** 2 / values
     one = Candidate(None, GAIN, share.sum(), 2, 0.0, 1.5, (values, share, 0.3))
-    each = [marginal(columns, target, size, temper) for size in (0.03, 0.3, 3.0)]
-    expected = np.logaddexp.reduce(each) - np.log(3) + 1.5
+    each = [marginal(columns, target, size, temper) for size in (0.003, 0.03, 0.3, 3.0)]
+    expected = np.logaddexp.reduce(each) - np.log(4) + 1.5
     assert one.tempered(temper).evidence == pytest.approx(expected, abs=0.02)
     # the more the residuals scatter, the less a cause can gain
     assert one.tempered(2 * temper).statistic == one.statistic
