@@ -348,6 +348,7 @@ def test_fit_that_does_not_arrive_warns(few, monkeypatch):
         cal = calibrate(chain, data, search=False, cross_validate=False)
     assert not cal.converged
     assert "NOT CONVERGED" in cal.summary()
+    assert cal.verdict().advice == "more angles of derotator and half-wave plate"
 
 
 def test_step_that_does_not_arrive_warns_too(few, monkeypatch):

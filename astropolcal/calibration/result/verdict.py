@@ -471,8 +471,8 @@ def _next(calibration, free, wrong, sky):
     telescope = "counts as published, without error" if published else "is not in the model"
     unknown = any(_absurd(free)) or bool(sky)
     at_odds = calibration.fit.get("outliers") and calibration.settings.get("loss") == "linear"
-    moved = (calibration.fit.get("disagreements") or [{}])[0].get("parameter", "")
-    apart = f"did {moved} move between datasets? --own {moved} gives each its own" if moved else ""
+    differs = (calibration.fit.get("disagreements") or [{}])[0].get("parameter", "")
+    apart = differs and f"did {differs} move between datasets? --own {differs} gives each its own"
     mask = "the frames at odds: mask them (mask_reason), or --loss bisquare"
     advice = (
         (_carried_off(calibration), mask),
