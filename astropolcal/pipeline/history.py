@@ -523,8 +523,8 @@ def courses(calibrations, parameters=None, *, events=()):
     dates = Time(told, scale="tai")
     priors = chances_of(dates, events, _CHANGE)
     rows = []
+    _check_independent(named)
     for what in parameters or optics_of(named):
-        _check_independent(named)
         found = compared(named, [what])
         if not found.slopes.size:
             # nothing of it is determined
