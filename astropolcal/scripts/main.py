@@ -59,7 +59,9 @@ class _OneLineParser(argparse.ArgumentParser):
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             # here, where the command is known: argparse complains in the name of the whole program
-            hint = did_you_mean(unknown[0].partition("=")[0], self._option_string_actions)
+            name = unknown[0].partition("=")[0]
+            # two dashes alone make short names alike
+            hint = did_you_mean(name, self._option_string_actions, cutoff=0.75)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return namespace, unknown
 
