@@ -231,11 +231,15 @@ class GapProblem:
 
     def vector(self, coefficients):
         """Return the canonical values of the free parameters, shape (n_free,)."""
+        return self.spread(coefficients) + self._rest
+
+    def spread(self, coefficients):
+        """Return how far coefficients, (..., n), move canonical values, shape (..., n_free)."""
         parts = [
-            block @ coefficients[self.slices[slot.name]]
+            coefficients[..., self.slices[slot.name]] @ block.T
             for slot, block in zip(self.free.slots, self._blocks, strict=True)
         ]
-        return np.concatenate(parts) + self._rest if parts else np.empty(0)
+        return np.concatenate([coefficients[..., :0], *parts], axis=-1)
 
     # ---- data ------------------------------------------------------------------------
 

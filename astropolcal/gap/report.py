@@ -9,6 +9,7 @@ import base64
 import io
 import warnings
 from contextlib import contextmanager, suppress
+from copy import copy as copied
 from copy import deepcopy
 from functools import cached_property
 from textwrap import wrap
@@ -18,15 +19,17 @@ import numpy as np
 from astropy.table import QTable
 
 from astropolcal import instruments, progress
-from astropolcal.calibration import calibrate, target_accuracies
+from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
+from astropolcal.calibration.fit.calibrate import standing_at
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.uncertainty.covariance import covariance_along
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
 from astropolcal.files import plain
 from astropolcal.gap import _words, runs
 from astropolcal.gap.planning import plan
-from astropolcal.gap.problem import TOUCHES
+from astropolcal.gap.problem import OPEN, TOUCHES
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
 from astropolcal.measurement import Measurement, Normal, parameter_table
@@ -491,15 +494,16 @@ def _with_causes_held(model, instrument):
 
 
 def with_causes(model, instrument=None):
-    """Calibrate the chains of a model, with what was found of its causes as priors of their sizes.
+    """Return a model as a calibration, with the errors that its fit of single differences leaves.
 
-    Double differences, which are fitted, may not show them, and what is not known of them is not
-    known of the other parameters either. Another mirror branch could move them.
+    Where these do not tell all of a cause, its components are no larger than is usual, or than the
+    largest of them. What is not known of the causes is not known of the other parameters, and on
+    sky, either.
     """
+    if not model.added:
+        return (model.calibration or _with_causes_held(model, instrument)).calibration()
     found, chains = Fitted(model), [chain.copy() for chain in model.chains]
-    added = {p.name: p for parameters in model.added.values() for p in parameters}
-    how = {"ties": model.problem.ties, "search": not added, "instrument": instrument}
-    for name, parameter in added.items():
+    for name, parameter in {p.name: p for own in model.added.values() for p in own}.items():
         slot = model.problem.free.by_name[name]
         optic, key = name.split(".")
         value, std, _ = (one / slot.factor for one in found.values(parameter))
@@ -509,7 +513,27 @@ def with_causes(model, instrument=None):
             size, own = np.shape(getattr(leaf, key).value), getattr(leaf, key)
             mean, error = (np.reshape(one, size) if size else one.item() for one in (value, std))
             own.prior = Normal(*((one * own.unit if own.unit else one) for one in (mean, error)))
-    return calibrate(chains, model.observations, **how, cross_validate=False)
+    measurement = Measurement(chains, model.observations, ties=model.problem.ties)
+    settings = {"strategy": "diagnosis", "fitter": "diagnose", "gauge": None}
+    told = {"converged": model.fit.converged, "message": "single differences of all frames"}
+    standing = standing_at(measurement, told, instrument=instrument, **settings)
+    return standing.calibration(covariance=_covariance(model, measurement.free))
+
+
+def _covariance(model, free):
+    """Return the covariance of the parameters of a model with causes."""
+    problem, q = copied(model.problem), model.fit.coefficients
+    problem.tight = problem.tight.copy()
+    for added in model.added.values():
+        rows = [problem.numbers([p.name]) for p in added]
+        scales = [np.full(len(row), p.canonical_scale) for row, p in zip(rows, added, strict=True)]
+        rows, scales = (np.concatenate([np.empty(0, dtype=int), *part]) for part in (rows, scales))
+        largest = np.max(np.abs(q - problem.absent)[rows] / scales, initial=1.0)
+        problem.tight[rows] = np.maximum(problem.tight[rows], 1 / (largest * scales))
+    singular, right, scale = problem.decomposed(q)
+    known, each = singular > OPEN * singular[0], problem.spread(right / scale)
+    sizes = np.sqrt(max(1.0, model.mean_square)) / singular[known, None]
+    return covariance_along(free, sizes * each[known] / free.steps, each[~known] / free.steps)
 
 
 def _median(values):

@@ -383,8 +383,8 @@ def _left_open(calibration, axes):
     """Return what the data do not determine beside what is at a bound, also where a prior does."""
     names = calibration.covariance.names
     null = np.reshape(calibration.identifiability.null_vectors, (-1, len(names)))
-    if calibration.settings.get("strategy") == "runs" or not len(null):
-        # its own data tell less than those of all runs do
+    if calibration.settings.get("strategy") in ("runs", "diagnosis") or not len(null):
+        # its own data tell less than those of all runs, or single differences, do
         return axes.open
     held = np.isin(names, calibration.at_bound)
     return np.concatenate([axes.open, _determined([null[:, held].T], len(null)) @ null])

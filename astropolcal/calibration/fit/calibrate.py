@@ -297,6 +297,19 @@ def fitted(
     return FittedMeasurement(measurement, whitened, settings, outcome, stages)
 
 
+def standing_at(measurement, told, **settings):
+    """Return a measurement as fitted where it stands, by more data than its own."""
+    measurement.note_inputs()
+    if measurement.weighting is None:
+        weighting = first_weighting(measurement, None).updated(measurement)
+        around = Problem(measurement, weighting).around()
+        measurement.weighting = weighting.updated(measurement, around)
+    whitened = Problem(measurement, measurement.weighting).around()
+    told = {"evaluations": None, "n_data": measurement.n_data, "seconds": 0.0} | told
+    settings = {"instrument": None, "loss": "linear", "errors": "scatter"} | settings
+    return FittedMeasurement(measurement, whitened, settings, told, stages=[])
+
+
 def _fixed(chain, fix):
     """Return copies of the chains with parameters held, and the names of these."""
     single = isinstance(chain, Model)
@@ -500,7 +513,7 @@ def _result(fitted, covariance=None):
     is_white = settings["errors"] == "white"
     scatter = None if is_white else Scatter.of(measurement, weighting, whitened)
     own = covariance_around(measurement, whitened, weighting, scatter)
-    if np.isfinite(weighting.level):
+    if covariance is None and np.isfinite(weighting.level):
         own, curved = _along_valleys(measurement, whitened, own, view)
         finding.near_null += curved
     if covariance is None:
@@ -542,7 +555,7 @@ def _result(fitted, covariance=None):
         fit["off_minimum"] = _moved(measurement, whitened, own)
         if len(outlying) and settings["loss"] == "linear":
             fit["outliers_move"] = _moved(measurement, whitened, own, outlying.meta["data"])
-        fit["against_prior"] = _against_prior(measurement, whitened, own)
+    fit["against_prior"] = _against_prior(measurement, whitened, calibration.covariance)
     outliers = columns(outlying)
     rows = zip(*outliers.values(), strict=True)
     fit["outliers"] = [dict(zip(outliers, row, strict=True)) for row in rows]

@@ -28,15 +28,15 @@ from astropy.modeling.fitting import TRFLSQFitter
 from astropy.table import QTable, Table
 from astropy.time import Time
 
-from astropolcal.calibration.fit.calibrate import ERRORS, FittedMeasurement
+from astropolcal.calibration.fit.calibrate import ERRORS, standing_at
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
-from astropolcal.calibration.identifiability.linearized import STILL, Whitened
+from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import rms
 from astropolcal.calibration.noise.scatter import Scatter
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
-from astropolcal.calibration.uncertainty.covariance import Covariance
+from astropolcal.calibration.uncertainty.covariance import covariance_along
 from astropolcal.chain import leaves
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, understood
@@ -471,15 +471,7 @@ class RunsCalibration:
 
     def _covariance(self, i):
         """Return the covariance of a run's parameters from all runs."""
-        free = self._model.work.shapes[i].free
-        known, null = self._model.errors_of(i)
-        per_unit = self._model.scales[i] / free.factors()
-        _, sizes, principal = np.linalg.svd(known, full_matrices=False)
-        factor = sizes[:, None] * principal * per_unit
-        open_ = (np.abs(null) > STILL).any(axis=0) | ~np.any(factor, axis=0)
-        matrix = factor.T @ factor
-        matrix[open_] = matrix[:, open_] = np.nan
-        return Covariance(free.names, free.units, matrix, factor=factor, null=null * per_unit)
+        return covariance_along(self._model.work.shapes[i].free, *self._model.errors_of(i))
 
     def calibration(self, run):
         """
@@ -499,20 +491,17 @@ class RunsCalibration:
         one, model = _prepared(*self._model.work.jobs[run]), self._model
         measurement = one.measurement
         measurement.stand_at(model.vectors[run])
-        whitened = Problem(measurement, measurement.weighting).around()
-        settings = {
-            "instrument": None,
-            "fitter": "calibrate_runs",
-            "strategy": "runs",
-            "loss": "linear",
-            "errors": "scatter" if one.scatter is not None else "white",
-            "gauge": "least change from the first run",
-            "runs": {"count": len(self), "varying": self._varying()},
-        }
         told = {"converged": self.converged, "message": f"one likelihood of {len(self)} runs"}
-        told |= {"evaluations": self.rounds, "n_data": measurement.n_data, "seconds": 0.0}
-        fitted = FittedMeasurement(measurement, whitened, settings, told, stages=[])
-        return fitted.calibration(covariance=self._covariance(run))
+        standing = standing_at(
+            measurement,
+            told | {"evaluations": self.rounds},
+            strategy="runs",
+            errors="scatter" if one.scatter is not None else "white",
+            fitter="calibrate_runs",
+            gauge="least change from the first run",
+            runs={"count": len(self), "varying": self._varying()},
+        )
+        return standing.calibration(covariance=self._covariance(run))
 
     def summary(self):
         """

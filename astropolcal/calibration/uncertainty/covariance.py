@@ -347,6 +347,21 @@ class _Spread:
         return matrix
 
 
+def covariance_along(free, known, null):
+    """Return the covariance of free parameters from a root of it, (k, n), and open directions.
+
+    Both per step of the parameters.
+    """
+    per_unit = free.steps / free.factors()
+    _, sizes, principal = np.linalg.svd(known, full_matrices=False)
+    factor = sizes[:, None] * principal * per_unit
+    null = null / np.linalg.norm(null, axis=1, keepdims=True)
+    open_ = (np.abs(null) > STILL).any(axis=0) | ~np.any(factor, axis=0)
+    matrix = factor.T @ factor
+    matrix[open_] = matrix[:, open_] = np.nan
+    return Covariance(free.names, free.units, matrix, factor=factor, null=null * per_unit)
+
+
 def full_covariance(calibration):
     """Return the covariance of a calibration with its determined and open directions.
 
