@@ -31,6 +31,7 @@ from astropolcal.gap.report import (
     causes_table,
     summary,
     to_dict,
+    with_causes,
     write_html,
 )
 from astropolcal.simulation import simulate
@@ -435,3 +436,13 @@ def test_what_takes_a_parameter_off_its_prior_may_be_what_the_model_lacks():
         assert (against and round(against["sigma"])) == sigma
         says = "it is 28 standard deviations from its prior, and may stand for something"
         assert (says in " ".join(told["sentences"])) == bool(sigma)
+
+
+def test_an_improved_model_is_a_calibration_with_the_sizes_and_errors_of_the_report(found):
+    seen, report = with_causes(found.improved), Fitted(found.improved)
+    (cause,) = found.causes
+    for name, size in report.sizes(cause.name).items():
+        optic, key = name.split(".")
+        std = [seen.covariance.std(f"{name}[{i}]") for i in range(len(size["std"]))]
+        assert np.allclose(getattr(seen.chains[0][optic], key), size["value"])
+        assert np.allclose(std, size["std"], rtol=0.01)
