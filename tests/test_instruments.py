@@ -391,6 +391,20 @@ def test_on_sky_needs_a_half_wave_plate():
             instruments.get(name).on_sky(chain)
 
 
+def test_on_sky_keeps_what_turns_with_the_plate_and_drops_the_lamp():
+    for name in ["charis", "irdis", "vampires"]:
+        instrument = instruments.get(name)
+        polarizer = optics.LinearPolarizer(name="polarizer")
+        error = optics.LinearRetarder(retardance=1 * u.deg, mount="hwp", name="error_of_plate")
+        plate = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
+        chain = polarizer | error | plate | optics.WollastonPrism(name="wollaston")
+        told = {"date": "2018-03-20", "wavelength": [1.245] * u.um}
+        known = {key: told[key] for key in instrument.sky_options}
+        names = [leaf.name for leaf in leaves(instrument.on_sky(chain, **known))]
+        assert names[-3:] == ["error_of_plate", "hwp", "wollaston"]
+        assert "polarizer" not in names
+
+
 # --- nothing outside of this folder knows an instrument -------------------------------------
 
 PACKAGE = Path(instruments.__file__).parents[1]

@@ -503,7 +503,8 @@ def with_causes(model, instrument=None):
     if not model.added:
         return (model.calibration or _with_causes_held(model, instrument)).calibration()
     found, chains = Fitted(model), [chain.copy() for chain in model.chains]
-    for name, parameter in {p.name: p for own in model.added.values() for p in own}.items():
+    causes = {p.name: p for own in model.added.values() for p in own}
+    for name, parameter in causes.items():
         slot = model.problem.free.by_name[name]
         optic, key = name.split(".")
         value, std, _ = (one / slot.factor for one in found.values(parameter))
@@ -514,9 +515,9 @@ def with_causes(model, instrument=None):
             mean, error = (np.reshape(one, size) if size else one.item() for one in (value, std))
             own.prior = Normal(*((one * own.unit if own.unit else one) for one in (mean, error)))
     measurement = Measurement(chains, model.observations, ties=model.problem.ties)
-    settings = {"strategy": "diagnosis", "fitter": "diagnose", "gauge": None}
+    settings = {"strategy": "diagnosis", "fitter": "diagnose", "gauge": "none"}
     told = {"converged": model.fit.converged, "message": "single differences of all frames"}
-    standing = standing_at(measurement, told, instrument=instrument, **settings)
+    standing = standing_at(measurement, told, tuple(causes), instrument=instrument, **settings)
     return standing.calibration(covariance=_covariance(model, measurement.free))
 
 

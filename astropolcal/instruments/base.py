@@ -507,8 +507,8 @@ class Instrument(ABC):
         """
         Return the chain of a star that has the optics of an internal chain.
 
-        The source goes, with what stands before the half-wave plate; ``telescope_optics``
-        come in their place.
+        The source goes, with what stands before the half-wave plate and does not turn with it;
+        ``telescope_optics`` come in their place.
 
         Parameters
         ----------
@@ -547,6 +547,9 @@ class Instrument(ABC):
             raise ChainError(
                 f"{self.name}: the chain has no optic {self.entrance!r} to put the telescope before"
             )
+        # what turns with it is a part of it, such as an error of its retardance
+        while start and found[start].stage and found[start - 1].stage == found[start].stage:
+            start -= 1
         behind = found[start:]
         return join([*self.telescope_optics(behind, **options), *behind])
 

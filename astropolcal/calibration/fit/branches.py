@@ -326,7 +326,7 @@ def _between(wavelength, phases):
     return found
 
 
-def undecided_signs(measurement, view, stds):
+def undecided_signs(measurement, view, stds, lawful=()):
     """
     Return, as mirror solutions are, what the data do not tell the sign of, at single wavelengths.
 
@@ -335,23 +335,25 @@ def undecided_signs(measurement, view, stds):
     better. Phases that fit exactly as well are a mirror solution anyway; what is zero within three
     of its ``stds`` has no sign. With them the mean squares of the errors of q and u that the other
     signs would be on sky, times their probabilities: in proportion to the polarization and apart
-    from it, (2, n_wavelengths); zero where the phases beside tell the sign.
+    from it, (2, n_wavelengths); zero where the phases beside tell the sign. What is
+    ``lawful`` stays as it is.
     """
     problem = BinProblem(measurement, measurement.weighting)
+    kept = [row for row, slot in enumerate(problem.slots) if slot.name in lawful]
     vector, found, errors = measurement.vector(), [], np.zeros((2, problem.n_bins))
-    costs, total = problem.polish(vector)[1], np.sum(problem.residuals(vector) ** 2)
+    costs, total = problem.polish(vector, kept=kept)[1], np.sum(problem.residuals(vector) ** 2)
     # no more degrees of freedom than are left
     whole = max(measurement.n_data - measurement.free.size, 1)
     count = problem._present.sum(axis=1) * min(whole / measurement.n_data, 1.0)
     phases = {row for row, *_ in problem.main_retardances()}
     signed = [row for row, slot in enumerate(problem.slots) if slot.name.endswith(_SIGNED)]
-    for row in (*phases, *signed):
+    for row in (row for row in (*phases, *signed) if row not in kept):
         slot, places = problem.slots[row], problem.elements[row]
         trial = vector.copy()
         trial[places] *= -1
         if row in phases:
             trial = problem.turned(trial, places, np.zeros(places.shape))
-        trial, new = problem.polish(np.clip(trial, *measurement.free.bounds()))
+        trial, new = problem.polish(np.clip(trial, *measurement.free.bounds()), kept=kept)
         others = _refitted(problem, vector, costs, trial, new)
         moved = np.abs(trial[places] - vector[places])
         if row in phases:

@@ -224,6 +224,8 @@ class FittedMeasurement:
     settings: dict
     fit: dict
     stages: list
+    #: Parameters with laws that a fit of the measurement alone does not know.
+    lawful: tuple = ()
 
     @property
     def chains(self):
@@ -297,7 +299,7 @@ def fitted(
     return FittedMeasurement(measurement, whitened, settings, outcome, stages)
 
 
-def standing_at(measurement, told, **settings):
+def standing_at(measurement, told, lawful=(), **settings):
     """Return a measurement as fitted where it stands, by more data than its own."""
     measurement.note_inputs()
     if measurement.weighting is None:
@@ -307,7 +309,7 @@ def standing_at(measurement, told, **settings):
     whitened = Problem(measurement, measurement.weighting).around()
     told = {"evaluations": None, "n_data": measurement.n_data, "seconds": 0.0} | told
     settings = {"instrument": None, "loss": "linear", "errors": "scatter"} | settings
-    return FittedMeasurement(measurement, whitened, settings, told, stages=[])
+    return FittedMeasurement(measurement, whitened, settings, told, [], lawful)
 
 
 def _fixed(chain, fix):
@@ -520,7 +522,7 @@ def _result(fitted, covariance=None):
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
     stds = own.stds * measurement.free.factors()
-    signs, errors_of_signs = undecided_signs(measurement, view, stds)
+    signs, errors_of_signs = undecided_signs(measurement, view, stds, fitted.lawful)
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
