@@ -16,7 +16,7 @@ from astropy.modeling import CompoundModel
 
 from astropolcal.exceptions import ChainError, ObservationError, ParameterError, warn
 from astropolcal.mueller import phase_of, turned
-from astropolcal.optics import COORDINATES, Optic
+from astropolcal.optics import COORDINATES, Optic, Perturbation
 from astropolcal.optics.laws import law_of
 from astropolcal.optics.positions import FLUXES, PLACES, finite_position
 from astropolcal.words import did_you_mean
@@ -188,6 +188,24 @@ def replace_optic(chain, name, optic):
     """
     old = find_optic(chain, name)
     return _again(chain, [optic if leaf is old else leaf for leaf in leaves(chain)])
+
+
+def parted(optics, start):
+    """Return what stands upstream of an optic, and the optic with what belongs to it and the rest.
+
+    To it belong optics that turn with it, as an error of its retardance, and those that have a
+    counterpart ``NAME_back`` downstream, as an error of its angle. A perturbation that follows its
+    stage may be one of the source.
+    """
+    own, behind = optics[start].stage, optics[start:]
+    backs = {optic.name for optic in behind}
+
+    def belongs(optic):
+        turns = own is not None and optic.stage == own and not isinstance(optic, Perturbation)
+        return turns or f"{optic.name}_back" in backs
+
+    front = optics[:start]
+    return [o for o in front if not belongs(o)], [*filter(belongs, front), *behind]
 
 
 def insert_optic(chain, optic, *, after=None, before=None):

@@ -13,6 +13,7 @@ import pytest
 from astropy.table import Table
 
 from astropolcal import calibrate, diagnose, instruments, optics
+from astropolcal.calibration.system import from_first_stage, split_chain
 from astropolcal.chain import join, leaves, stages
 from astropolcal.exceptions import AstropolcalError, ChainError, InstrumentError
 from astropolcal.instruments import CHARIS, Instrument, SkyLaw
@@ -391,18 +392,25 @@ def test_on_sky_needs_a_half_wave_plate():
             instruments.get(name).on_sky(chain)
 
 
-def test_on_sky_keeps_what_turns_with_the_plate_and_drops_the_lamp():
+def test_on_sky_keeps_what_belongs_to_the_plate_and_drops_what_belongs_to_the_lamp():
     for name in ["charis", "irdis", "vampires"]:
         instrument = instruments.get(name)
         polarizer = optics.LinearPolarizer(name="polarizer")
-        error = optics.LinearRetarder(retardance=1 * u.deg, mount="hwp", name="error_of_plate")
+        lamp = optics.Perturbation(kind="rotation", dependence="harmonic:hwp:2", name="lamp")
+        angle = optics.HarmonicRotator(mount="hwp", name="angle")
+        error = optics.LinearRetarder(retardance=1 * u.deg, mount="hwp", name="error")
         plate = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")
-        chain = polarizer | error | plate | optics.WollastonPrism(name="wollaston")
+        back = optics.HarmonicRotator(mount="hwp", name="angle_back")
+        chain = polarizer | lamp | angle | error | plate | back
+        chain |= optics.WollastonPrism(name="wollaston")
         told = {"date": "2018-03-20", "wavelength": [1.245] * u.um}
         known = {key: told[key] for key in instrument.sky_options}
+        mine = ["angle", "error", "hwp", "angle_back", "wollaston"]
+        assert [leaf.name for leaf in split_chain(chain)[1]] == mine
+        assert [leaf.name for leaf in leaves(from_first_stage(chain))] == mine
         names = [leaf.name for leaf in leaves(instrument.on_sky(chain, **known))]
-        assert names[-3:] == ["error_of_plate", "hwp", "wollaston"]
-        assert "polarizer" not in names
+        assert names[-5:] == mine
+        assert not {"polarizer", "lamp"} & set(names)
 
 
 # --- nothing outside of this folder knows an instrument -------------------------------------

@@ -6,11 +6,11 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
-from astropolcal.chain import join, leaves, system_mueller, system_mueller_derivatives
+from astropolcal.chain import join, leaves, parted, system_mueller, system_mueller_derivatives
 from astropolcal.exceptions import ChainError, ParameterError, WavelengthRangeError
 from astropolcal.measurement.parameters import FreeParameters
 from astropolcal.observations.reading import SAME_WAVELENGTH, nearest_bins
-from astropolcal.optics import COORDINATES
+from astropolcal.optics import COORDINATES, Perturbation
 from astropolcal.propagation import Propagator
 from astropolcal.units import canonical_factor, mjd_of, wavelengths_of
 
@@ -382,12 +382,10 @@ def free_of(calibration):
 def from_first_stage(chain, wanted=None):
     """Return the optics from the first on a stage, or on one of those that are wanted."""
     found = leaves(chain)
-    places = [leaf.stage for leaf in found]
-    for i, place in enumerate(places):
-        is_first = place and place not in COORDINATES if wanted is None else place in wanted
-        if is_first:
-            return join(found[i:])
-    if wanted is None and any(place in COORDINATES for place in places):
+    for i, optic in enumerate(found):
+        if _is_first(optic) if wanted is None else optic.stage in wanted:
+            return join(found[i:] if wanted else parted(found, i)[1])
+    if wanted is None and any(optic.stage in COORDINATES for optic in found):
         # whatever is in several states is not a source
         return chain
     raise ChainError("the chain has no optic on a stage; give the chain from the sky")
@@ -397,9 +395,15 @@ def split_chain(chain):
     """Return the optics upstream of the first stage of the instrument, and the others."""
     found = leaves(chain)
     # up to there it is the telescope, which turns the sky, or the calibration source
-    fixed = (i for i, leaf in enumerate(found) if leaf.stage and not leaf.rotates_frame)
-    start = next((i for i in fixed if found[i].stage not in COORDINATES), 0)
-    return found[:start], found[start:]
+    fixed = (i for i, o in enumerate(found) if _is_first(o) and not o.rotates_frame)
+    start = next(fixed, 0)
+    return parted(found, start) if start else ([], found)
+
+
+def _is_first(optic):
+    """Return whether an optic stands on a stage; a perturbation only follows it."""
+    is_on = optic.stage and optic.stage not in COORDINATES
+    return bool(is_on) and not isinstance(optic, Perturbation)
 
 
 def at_wavelengths(chain, mix, size):

@@ -253,7 +253,10 @@ def places(chain):
     turning = [o for o in found if o.stage is not None and o.stage not in COORDINATES]
     turning = [o for o in turning if not o.splits_light]
     first = turning[0] if turning else found[-1]
-    out = [Place("source", before=first.name)] if found[0] is not first else []
+    lamp = found[: found.index(first)]
+    # upstream of what belongs to the first, too
+    nearest = lamp[-1].name if lamp else None
+    out = [Place("source", None if nearest else first.name, nearest)] if lamp else []
     own = [o for o in turning if o.stage not in _SKY and not o.rotates_frame]
     if own and own[0] is not first:
         out.append(Place("telescope", before=own[0].name))

@@ -505,7 +505,7 @@ def check_instruments(calibration, observations):
 
 
 def _conclude(nominal, base, exchanged, selection, frames):
-    improved = selection.model
+    improved = selection.model.modest()
     total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
     # shares are of the excess over the noise; a gap below it must not give more than 1
     total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)

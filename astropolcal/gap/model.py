@@ -3,7 +3,8 @@
 
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass, field
+from copy import copy as copied
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
 
@@ -74,6 +75,9 @@ _SEARCHES, _STEPS = 2, 15
 _FLUXES, _DESCRIBES = 3, 1.5
 # keeps directions that are open, of columns of unit length
 _HELD = 1e-10
+# so often causes are fitted with their parts as large as the largest of them, as long as this
+# falls below such a share
+_SHRINKS, _SMALLER = 10, 0.9
 # a retardance as near to half a wave as this (radian) is at it
 _HALF_WAVE = 1e-3
 # a second difference above this share of the first one is tried at finite size
@@ -360,6 +364,34 @@ class Model:
             problem.follow(*told)
             fit = first
         return Model(problem, fit, self.added)
+
+    def modest(self):
+        """Return the model with causes whose parts are no larger than the data ask for.
+
+        What the data do not tell of a cause, as a rotation that may be that of the lamp, is taken
+        to be as large as the largest of its parts, or as is usual, and no longer as its limits.
+        """
+        problem, fit, own = copied(self.problem), self.fit, {}
+        for name, added in self.added.items():
+            rows = [problem.numbers([one.name]) for one in added]
+            usual = [
+                np.full(len(row), p.canonical_scale) for row, p in zip(rows, added, strict=True)
+            ]
+            if any(map(len, rows)):
+                own[name] = np.concatenate(rows), np.concatenate(usual)
+        before = dict.fromkeys(own, np.inf)
+        for _ in range(_SHRINKS):
+            away = np.abs(fit.coefficients - problem.absent)
+            largest = {n: np.max(away[r] / usual, initial=1.0) for n, (r, usual) in own.items()}
+            if all(size > _SMALLER * before[name] for name, size in largest.items()):
+                break
+            problem.tight = self.problem.tight.copy()
+            for name, (rows, usual) in own.items():
+                known = 1 / (largest[name] * usual)
+                problem.tight[rows] = np.maximum(problem.tight[rows], known)
+            problem.centre = np.where(problem.tight > 0, problem.absent, 0.0)
+            fit, before = problem.fit(fit.coefficients), largest
+        return replace(self, problem=problem, fit=fit) if own else self
 
     def is_physical(self, name):
         """Return whether the fitted values of an effect are possible.

@@ -9,7 +9,6 @@ import base64
 import io
 import warnings
 from contextlib import contextmanager, suppress
-from copy import copy as copied
 from copy import deepcopy
 from functools import cached_property
 from textwrap import wrap
@@ -523,15 +522,8 @@ def with_causes(model, instrument=None):
 
 def _covariance(model, free):
     """Return the covariance of the parameters of a model with causes."""
-    problem, q = copied(model.problem), model.fit.coefficients
-    problem.tight = problem.tight.copy()
-    for added in model.added.values():
-        rows = [problem.numbers([p.name]) for p in added]
-        scales = [np.full(len(row), p.canonical_scale) for row, p in zip(rows, added, strict=True)]
-        rows, scales = (np.concatenate([np.empty(0, dtype=int), *part]) for part in (rows, scales))
-        largest = np.max(np.abs(q - problem.absent)[rows] / scales, initial=1.0)
-        problem.tight[rows] = np.maximum(problem.tight[rows], 1 / (largest * scales))
-    singular, right, scale = problem.decomposed(q)
+    problem = model.problem
+    singular, right, scale = problem.decomposed(model.fit.coefficients)
     known, each = singular > OPEN * singular[0], problem.spread(right / scale)
     sizes = np.sqrt(max(1.0, model.mean_square)) / singular[known, None]
     return covariance_along(free, sizes * each[known] / free.steps, each[~known] / free.steps)

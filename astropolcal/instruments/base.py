@@ -23,7 +23,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join, leaves, stages
+from astropolcal.chain import join, leaves, parted, stages
 from astropolcal.exceptions import ChainError, InstrumentError
 from astropolcal.instruments import telescope as shared
 from astropolcal.instruments.layout import COMMON, FileLayout
@@ -547,10 +547,7 @@ class Instrument(ABC):
             raise ChainError(
                 f"{self.name}: the chain has no optic {self.entrance!r} to put the telescope before"
             )
-        # what turns with it is a part of it, such as an error of its retardance
-        while start and found[start].stage and found[start - 1].stage == found[start].stage:
-            start -= 1
-        behind = found[start:]
+        _, behind = parted(found, start)
         return join([*self.telescope_optics(behind, **options), *behind])
 
     def _from_sky(self, chain, **known):
