@@ -284,7 +284,7 @@ def check_together(actions, arguments):
         for rule, name in getattr(action, "together", ()):
             # a shared option has companions that some commands do not have
             if name in known and (known[name] in given) == (rule == "not"):
-                words, value = action.option_strings[-1], getattr(arguments, action.dest)
+                words, value = label_of(action.dest), getattr(arguments, action.dest)
                 if not isinstance(value, bool | list):
                     words += f" {value}".removesuffix(".0")
                 words += " cannot be combined with " if rule == "not" else " needs "

@@ -42,7 +42,7 @@ OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --calibration LIB_OR_FILE Input required  a calibration file, or a folder of them, from which the
     one that holds for the frames is taken
--o --output OUT.fits Output  the product; overwritten if it exists
+-o --output OUT.fits Output not:archive  the product; overwritten if it exists
 --mode {stokes,ip} =stokes  stokes (default): invert the Mueller matrices; ip: instrumental
     polarization only
 --observable {intensity,single,double}  what is fitted: the beams, or their single or double
@@ -77,9 +77,9 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
     named after, in degrees
 --samples N int =0  systematic errors from N samples of the calibration (default: linearized)
 --seed N int needs:samples  of the random numbers of --samples
---spectrum OUT.ecsv Output  table of the star in an aperture
+--spectrum OUT.ecsv Output not:archive  table of the star in an aperture
 --radius PIXELS float  of the aperture (default: 10, or half of a smaller --size)
---plot FILE Drawing  figure of the result
+--plot FILE Drawing not:archive  figure of the result
 --workers N int  threads; with --archive: processes (default: one per processor)
 --cluster ADDRESS  scheduler of dask.distributed, in place of these
 @ full json online quiet
@@ -143,7 +143,7 @@ def run(arguments):
     """Correct the cubes, or the archive, and write the product."""
     _check_options(arguments)
     common.check_suffix("--spectrum", arguments.spectrum, ".ecsv")
-    if is_archive(arguments, ("spectrum", "plot")):
+    if is_archive(arguments):
         return run_archive("correct", arguments)
     common.check_suffix("-o", arguments.output, ".fits")
     return work(arguments)
