@@ -56,7 +56,7 @@ class CHARIS(SubaruPolarimeter):
     name = "charis"
     aliases = ("SCExAO/CHARIS", "Subaru/SCExAO/CHARIS")
     # bins of equal resolving power, as the cubes of the extraction have them
-    wavelength = subaru.CHARIS_FIT["wavelength"].value * u.nm
+    wavelength = subaru.CHARIS_FIT["wavelength"].copy()
     keywords = SubaruPolarimeter.keywords | {"parallactic": "PARANG"}
     files = FileLayout(
         keywords=COMMON
