@@ -24,15 +24,7 @@ from astropolcal.observations.reading import stated_date
 
 __all__ = ["CHARIS"]
 
-# McIntosh et al. 2026, Dataset 3, final fit for each of the 22 bins (in the signs they publish);
-# horizontal retardances: `DEROTATOR_HORIZONTAL`
-_DEROTATOR_DIAGONAL = [5.08, 5.68, 6.16, 6.8, 5.0, 4.88, 5.01, 4.56, 4.05, 3.78, 3.57, 3.2, 2.9,
-                       2.88, 2.36, 2.08, 2.27, 2.51, 2.81, 3.16, 3.76, 4.07]  # fmt: skip
-_DEROTATOR_CIRCULAR = [0, 0, 0, 0, 0, 0, 1.69, 3.1, 3.74, 4.5, 4.73, 4.8, 5.01, 5.27, 5.25, 5.07,
-                       5.14, 5.11, 5.05, 4.88, 5.18, 4.83]  # fmt: skip
-_EFFICIENCY = [1.0, 0.992, 0.9953, 0.9816, 0.97, 0.9905, 0.9892, 0.9903, 0.9908, 0.9911, 0.9896,
-               0.9889, 0.9904, 0.9888, 0.9887, 0.9878, 0.9902, 0.9868, 0.9875, 0.9818, 0.9746,
-               0.9523]  # fmt: skip
+# McIntosh et al. 2026, as `CHARIS_FIT`
 _PUBLISHED_SIO2, _PUBLISHED_MGF2 = 1.653, 1.291
 _PUBLISHED_MISALIGNMENT = {"calibration_polarizer": 90.03, "derotator": -0.02, "hwp": -0.04}
 
@@ -64,7 +56,7 @@ class CHARIS(SubaruPolarimeter):
     name = "charis"
     aliases = ("SCExAO/CHARIS", "Subaru/SCExAO/CHARIS")
     # bins of equal resolving power, as the cubes of the extraction have them
-    wavelength = subaru.BINS
+    wavelength = subaru.CHARIS_FIT["wavelength"].copy()
     keywords = SubaruPolarimeter.keywords | {"parallactic": "PARANG"}
     files = FileLayout(
         keywords=COMMON
@@ -190,10 +182,10 @@ class CHARIS(SubaruPolarimeter):
         hwp, derotator = chain["hwp"], chain["derotator"]
         # (H, 45) with the other sign, see the signs at the top
         hwp.w_sio2, hwp.w_mgf2 = _PUBLISHED_SIO2 * u.mm, _PUBLISHED_MGF2 * u.mm
-        derotator.horizontal = -np.array(subaru.DEROTATOR_HORIZONTAL) * u.deg
-        derotator.diagonal = -np.array(_DEROTATOR_DIAGONAL) * u.deg
-        derotator.circular = np.array(_DEROTATOR_CIRCULAR) * u.deg
-        chain["wollaston"].efficiency = _EFFICIENCY
+        derotator.horizontal = -subaru.CHARIS_FIT["horizontal"]
+        derotator.diagonal = -subaru.CHARIS_FIT["diagonal"]
+        derotator.circular = subaru.CHARIS_FIT["circular"]
+        chain["wollaston"].efficiency = subaru.CHARIS_FIT["efficiency"]
         for name, angle in _PUBLISHED_MISALIGNMENT.items():
             chain[name].theta = angle * u.deg
         return chain

@@ -53,7 +53,8 @@ _DATA = QTable.read(Path(__file__).parents[1] / "data" / "irdis.ecsv", format="a
 
 #: Filters with coefficients, and the wavelengths that stand for them.
 FILTERS = tuple(str(name) for name in _DATA["filter"])
-CENTRES = _DATA["wavelength"]
+# a copy: a column knows its table, and cannot go to other processes
+CENTRES = _DATA["wavelength"].copy()
 #: Day from which the telescope's mirrors have their new coating, and the names of both.
 RECOATING = _DATA.meta["recoating"]
 COATINGS = ("before", "after")

@@ -6,9 +6,11 @@ On sky a star and the mirrors of the telescope stand before the half-wave plate.
 """
 
 import re
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from astropolcal import optics, standards
 from astropolcal.chain import leaves
@@ -305,12 +307,9 @@ def entrance(source, grid, star, target, m3, mirror=tertiary_mirror):
     return [mounted(optics.Diattenuator(diattenuation=np.zeros(grid.size), name="fold_mirror"))]
 
 
-#: Bins of equal resolving power, as the cubes of CHARIS have them.
-BINS = np.geomspace(1159.5614, 2369.3441, 22) * u.nm
-# McIntosh et al. 2026, Dataset 3, final fit for each of the bins (in the signs they publish)
-DEROTATOR_HORIZONTAL = [251.47, 235.97, 223.97, 209.45, 166.71, 153.47, 140.0, 124.37, 110.61,
-                         98.49, 86.98, 77.67, 71.03, 65.73, 60.99, 58.05, 56.51, 55.28, 54.92,
-                         55.18, 56.02, 57.04]  # fmt: skip
+#: McIntosh et al. 2026, Dataset 3: the final fit for each of the bins of the cubes of CHARIS, which
+#: have equal resolving power, in the signs they publish.
+CHARIS_FIT = QTable.read(Path(__file__).parents[1] / "data" / "charis.ecsv", format="ascii.ecsv")
 #: Bounds of the derotator's retardances, by their name.
 BOUNDS = {
     # every sign and mirror branch of the retardances
@@ -338,5 +337,6 @@ def derotator(kind, start, bounds):
 
 def published_derotator(grid, kind="elliptical", bounds="physical"):
     """Return a derotator within some of `BOUNDS`, with the published retardances in our sign."""
-    start = -np.interp(grid.to_value(u.nm), BINS.value, DEROTATOR_HORIZONTAL) * u.deg
+    bins = CHARIS_FIT["wavelength"].to_value(u.nm)
+    start = -np.interp(grid.to_value(u.nm), bins, CHARIS_FIT["horizontal"])
     return derotator(kind, start, BOUNDS[bounds])

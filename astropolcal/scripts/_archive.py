@@ -29,7 +29,6 @@ _DRIVING = (
     *("run", "command", "cubes", "output", "json", "quiet", "full", "online", "archive", "target"),
     *("retry", "timeout", "workers", "cluster", "gap", "cycles"),
 )
-_ONLY = {"gap": 30.0, "cycles": None, "target": None, "retry": False, "timeout": None}
 _PRELOADED = ("scripts._correct", "scripts._reduce", "correction", "reduction", "pipeline.library")
 # of an entry of the manifest, what does not tell how the product was made
 _OF_ENTRY = ("name", "key", "n_files", "first", "source", "state")
@@ -37,21 +36,12 @@ _OF_ENTRY = ("name", "key", "n_files", "first", "source", "state")
 _MOST_LISTED, _MOST_DOUBTS = 1000, 20
 
 
-def is_archive(arguments, single):
-    """Return whether a whole archive is asked for; refuse options that have no meaning then."""
+def is_archive(arguments):
+    """Return whether a whole archive is asked for; refuse numbers that none can have."""
     if arguments.archive is None:
-        for name, usual in _ONLY.items():
-            if getattr(arguments, name) != usual:
-                raise ParameterError(f"--{name}: is for --archive DIR")
         if arguments.output is None:
             raise ParameterError("-o FILE is needed, or --archive DIR for a whole archive")
         return False
-    for name in ("output", *single):
-        if (value := getattr(arguments, name)) is not None:
-            raise ParameterError(
-                f"{common.label_of(name)} {value}: names one file; --archive has a product for "
-                "each sequence"
-            )
     for name in ("gap", "cycles", "timeout"):
         value = getattr(arguments, name)
         if value is not None and not (value > 0 and np.isfinite(value)):

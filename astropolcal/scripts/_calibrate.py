@@ -35,14 +35,15 @@ files FILE * Input  observation tables (ECSV)
 -o --output CAL.asdf Output  write the calibration here; overwritten if it exists
 --instrument NAME  default: as the tables say
 @ derotator bounds m3 plate
---exact  take the polarization of standard stars and the orientation of fixed optics as exact, as
-    published calibrations do; by default they have the errors of the catalogue and of the mounting
+--exact not:start  take the polarization of standard stars and the orientation of fixed optics as
+    exact, as published calibrations do; by default they have the errors of the catalogue and of the
+    mounting
 --nuisance KIND[:DATASET] ...  add what differs from dataset to dataset, with a prior: background,
     beam_gain, or lamp (q and u of an unpolarized internal source); for all datasets or for one
 --observable NAME  what is fitted (default: normalized_double_difference; single differences of
     tables without half-wave plate, and the intensity of single beams)
---strategy HOW =joint  joint (default), two-step (the paper's fit of a polarized source), or
-    sequential: polarized source, unpolarized source, stars, each step holding what came before
+--strategy HOW =joint not:start  joint (default), two-step (the paper's fit of a polarized source),
+    or sequential: polarized source, unpolarized source, stars, each step holding what came before
 --loss NAME =linear  linear (default: least squares), huber, cauchy or bisquare: data far off count
     less
 --keep-all  mask nothing by itself: neither an unstable lamp, nor saturated frames, nor incomplete
@@ -52,10 +53,10 @@ files FILE * Input  observation tables (ECSV)
 --errors {scatter,white} =scatter  errors from how the residuals scatter and are correlated
     (default), or those of independent data with the noise of --weights
 @ fix free
---own NAME[=GROUP,...] ...  a parameter with a value of its own in each table, or in each group of
-    tables, such as hwp.theta=july,july,october; all others are shared
+--own NAME[=GROUP,...] ... not:start  a parameter with a value of its own in each table, or in each
+    group of tables, such as hwp.theta=july,july,october; all others are shared
 --start OLD.asdf Input  start from this calibration, hold it, and refit only what --free names
---prior NAME=MEAN+-STD ...  normal prior on a parameter, such as hwp.theta=0+-0.1deg
+--prior NAME=MEAN+-STD ... not:start  normal prior on a parameter, such as hwp.theta=0+-0.1deg
 --gauge {minimal,none} =minimal  where the data leave a choice: the least misalignments (default),
     or where the fit ends
 @ without
@@ -78,8 +79,9 @@ def run(arguments):
     from astropolcal.calibration.validation.targets import TARGETS
 
     common.check_suffix("-o", arguments.output, ".asdf")
-    _check_start(arguments)
     # raises before any table is read
+    if arguments.start and not arguments.free:
+        raise AstropolcalError("--start holds everything: say with --free NAME what may change")
     if arguments.observable is not None:
         get_observable(arguments.observable)
     targets = [_target(text) for text in arguments.target] or TARGETS
@@ -193,20 +195,6 @@ def _own(texts):
             raise ParameterError(f"--own {empty[0]}=...: each group needs a name")
         return found
     return [name for name, _ in pairs]
-
-
-def _check_start(arguments):
-    """Refuse what a calibration to start from settles already."""
-    if not arguments.start:
-        return
-    # they would contradict what the old calibration holds
-    keys = ("fix", "prior", "without", "own", "exact", *common.MODEL)
-    given = [f"--{key}" for key in keys if getattr(arguments, key)]
-    given += [f"--strategy {arguments.strategy}"] if arguments.strategy != "joint" else []
-    if given:
-        raise AstropolcalError(f"{given[0]} cannot be combined with --start; --free can")
-    if not arguments.free:
-        raise AstropolcalError("--start holds everything: say with --free NAME what may change")
 
 
 def _target(text):

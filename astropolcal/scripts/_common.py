@@ -224,8 +224,8 @@ def add_command(commands, name, module):
         if entry.startswith("["):
             place = parser.add_argument_group(entry.strip("[]"))
             continue
-        flags, settings = option(entry, getattr(module, "TYPES", {}))
-        place.add_argument(*flags, **settings)
+        flags, settings, together = option(entry, getattr(module, "TYPES", {}))
+        place.add_argument(*flags, **settings).together = together
 
 
 def entries(text):
@@ -239,15 +239,16 @@ def entries(text):
 
 
 def option(entry, types):
-    """Return the names and the settings of ``add_argument`` that an entry describes.
+    """Return names, settings of ``add_argument`` and companions that an entry describes.
 
     Before two spaces stand names and value as the help shows them, such as ``-o --output FILE`` or
     ``--kind {a,b}``; the name of a type; ``=DEFAULT``; ``required``; ``?``, ``*`` or ``+`` as in
-    ``nargs``; ``...`` if it may be repeated. After them stands what it means. An option that takes
-    no value is a switch.
+    ``nargs``; ``...`` if it may be repeated; ``needs:NAME`` and ``not:NAME`` for `check_together`.
+    After them stands what it means. An option that takes no value is a switch.
     """
     form, _, meaning = entry.partition("  ")
-    flags, settings, known = [], {"help": " ".join(meaning.split())}, _TYPES | types
+    flags, settings, together = [], {"help": " ".join(meaning.split())}, []
+    known = _TYPES | types
     for word in form.split():
         if word.startswith("-") or not flags:
             flags.append(word)
@@ -264,13 +265,36 @@ def option(entry, types):
         elif word == "...":
             several = {"action": "append", "default": []}
             settings |= {"action": "extend"} if "nargs" in settings else several
+        elif word.startswith(("needs:", "not:")):
+            together.append(word.split(":"))
         elif word in known:
             settings["type"] = known[word]
         else:
             settings |= {"metavar": word} | ({"type": _pair} if "=" in word else {})
     if flags[0].startswith("-") and len(settings) == 1:
         settings["action"] = "store_true"
-    return flags, settings
+    return flags, settings, together
+
+
+def check_together(actions, arguments):
+    """Refuse options without one that they need, or beside one that they contradict."""
+    known = {action.dest: action for action in actions}
+    given = [a for a in actions if getattr(arguments, a.dest, a.default) != a.default]
+    for action in given:
+        for rule, name in getattr(action, "together", ()):
+            # a shared option has companions that some commands do not have
+            if name in known and (known[name] in given) == (rule == "not"):
+                words, value = label_of(action.dest), getattr(arguments, action.dest)
+                if not isinstance(value, bool | list):
+                    words += f" {value}".removesuffix(".0")
+                words += " cannot be combined with " if rule == "not" else " needs "
+                raise ParameterError(words + _shown(known[name]))
+
+
+def _shown(action):
+    """Return how an option is typed, with what stands for its value."""
+    values = action.metavar or "|".join(c for c in action.choices or () if c != action.default)
+    return " ".join([*action.option_strings[-1:], values])
 
 
 def _pair(text):
@@ -289,13 +313,13 @@ def stated_model(arguments):
 
 #: Options that several commands have, by name; ``online`` is obeyed by `astropolcal.scripts.main`.
 _SHARED = """
---derotator MODEL  elliptical (default) or linear retarder, or kmirror: three silver mirrors with
-    films
---bounds KIND  physical (default), or those of the paper
---m3 MODEL  tertiary mirror of stars: free (default, a diattenuation per wavelength), 'power law'
-    (the paper's permittivity) or metal (silver with a film)
---plate MODEL  half-wave plate of VAMPIRES: free (default, a retardance per band) or two-layer (one
-    law for all bands)
+--derotator MODEL not:start  elliptical (default) or linear retarder, or kmirror: three silver
+    mirrors with films
+--bounds KIND not:start  physical (default), or those of the paper
+--m3 MODEL not:start  tertiary mirror of stars: free (default, a diattenuation per wavelength),
+    'power law' (the paper's permittivity) or metal (silver with a film)
+--plate MODEL not:start  half-wave plate of VAMPIRES: free (default, a retardance per band) or
+    two-layer (one law for all bands)
 --full  print everything; by default what fits a terminal of 80 columns and 24 lines
 --json FILE Output  write a summary for machines (- for stdout)
 --online  fetch new tables of the Earth's rotation; by default the network is not used
@@ -303,15 +327,16 @@ _SHARED = """
 --plots DIR Folder  save the figures in this folder
 --archive DIR Folder  work on all sequences in the folders that are named and in those inside, and
     write products, index and manifest to this folder; what is there already is not done again
---gap MINUTES float =30  with --archive: time without a frame after which another sequence begins
-    (default: 30)
---cycles N int  with --archive: cut sequences after so many cycles of the half-wave plate
---target PATTERN  with --archive: only objects such as 'HD*'
---retry  with --archive: try the sequences that failed again
---timeout MINUTES float  with --archive: give a sequence up after this time
---fix NAME[=VALUE] ...  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
+--gap MINUTES float =30 needs:archive  with --archive: time without a frame after which another
+    sequence begins (default: 30)
+--cycles N int needs:archive  with --archive: cut sequences after so many cycles of the half-wave
+    plate
+--target PATTERN needs:archive  with --archive: only objects such as 'HD*'
+--retry needs:archive  with --archive: try the sequences that failed again
+--timeout MINUTES float needs:archive  with --archive: give a sequence up after this time
+--fix NAME[=VALUE] ... not:start  hold a parameter, such as hwp.theta=0 or hwp.theta=0.1deg
 --free NAME ...  free a parameter, such as wollaston.theta
---without OPTIC ...  take an optic out of the model
+--without OPTIC ... not:start  take an optic out of the model
 """
 _SHARED = {re.search(r"--(\w+)", entry)[1]: entry for entry in entries(_SHARED)}
 

@@ -42,7 +42,7 @@ OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --calibration LIB_OR_FILE Input required  a calibration file, or a folder of them, from which the
     one that holds for the frames is taken
--o --output OUT.fits Output  the product; overwritten if it exists
+-o --output OUT.fits Output not:archive  the product; overwritten if it exists
 --mode {stokes,ip} =stokes  stokes (default): invert the Mueller matrices; ip: instrumental
     polarization only
 --observable {intensity,single,double}  what is fitted: the beams, or their single or double
@@ -66,9 +66,9 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --size PIXELS int =51  width of the images of the product (default: 51)
 --rotation {none,fixed,pupil} =none  how the field turned: not known, images stay as they are
     (default); the +y axis at a fixed position angle; at a fixed angle from the zenith
---camera-angle DEG angle  position angle of the +y axis, or with --rotation pupil that from the
-    zenith (default: 0)
---mirrored  east is to the right of north
+--camera-angle DEG angle needs:rotation  position angle of the +y axis, or with --rotation
+    pupil that from the zenith (default: 0)
+--mirrored needs:rotation  east is to the right of north
 --subtract-star STAR star  subtract the polarization of the star from its light: annulus=IN,OUT
     measures it between two radii in pixels, DEG%%,DEG (0.8+-0.1,45+-3) states degree in percent and
     angle, with their errors (exact without them)
@@ -76,10 +76,10 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
     determine: infinite (default), ignore, or the standard deviation of the angle that each is
     named after, in degrees
 --samples N int =0  systematic errors from N samples of the calibration (default: linearized)
---seed N int  of the random numbers of --samples
---spectrum OUT.ecsv Output  table of the star in an aperture
+--seed N int needs:samples  of the random numbers of --samples
+--spectrum OUT.ecsv Output not:archive  table of the star in an aperture
 --radius PIXELS float  of the aperture (default: 10, or half of a smaller --size)
---plot FILE Drawing  figure of the result
+--plot FILE Drawing not:archive  figure of the result
 --workers N int  threads; with --archive: processes (default: one per processor)
 --cluster ADDRESS  scheduler of dask.distributed, in place of these
 @ full json online quiet
@@ -143,7 +143,7 @@ def run(arguments):
     """Correct the cubes, or the archive, and write the product."""
     _check_options(arguments)
     common.check_suffix("--spectrum", arguments.spectrum, ".ecsv")
-    if is_archive(arguments, ("spectrum", "plot")):
+    if is_archive(arguments):
         return run_archive("correct", arguments)
     common.check_suffix("-o", arguments.output, ".fits")
     return work(arguments)
@@ -237,16 +237,7 @@ def _sorted(files, instrument):
 
 
 def _check_options(arguments):
-    """Refuse options that have no meaning beside the others, before any work is done."""
-    if arguments.rotation == "none" and arguments.camera_angle is not None:
-        raise ParameterError(
-            f"--camera-angle {arguments.camera_angle:g}: is for --rotation fixed or --rotation "
-            "pupil; with --rotation none the images are not turned"
-        )
-    if arguments.rotation == "none" and arguments.mirrored:
-        raise ParameterError("--mirrored: with --rotation none the images are not turned")
-    if arguments.seed is not None and not arguments.samples:
-        raise ParameterError(f"--seed {arguments.seed}: is for --samples N")
+    """Refuse options that do not fit one another, before any work is done."""
     check_seed(arguments.seed)
     # a size that is none is refused with the images, whose width it depends on
     largest, star = arguments.size / 2, arguments.subtract_star or {}

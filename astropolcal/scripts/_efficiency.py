@@ -44,8 +44,8 @@ file CAL.asdf ? Input  calibration
 --parallactic DEG angle  default: 0
 --derotator DEG + angle  angles of the table (default: 0 to 90 in steps of 15)
 --wavelength UM + float  wavelengths of the table in micrometre, the nearest calibrated ones
---target RA,DEC  for the best derotator offset: degrees, or 05:26:06,+16:42:00
---night START/END  times in UTC, with --target
+--target RA,DEC needs:night  for the best derotator offset: degrees, or 05:26:06,+16:42:00
+--night START/END needs:target  times in UTC, with --target
 --law MODE  what the derotator stabilizes, such as field (default: pupil); with --target, or where
     the law of the half-wave plate depends on it
 --date DATE  of the telescope's mirrors, where that matters
@@ -57,7 +57,7 @@ file CAL.asdf ? Input  calibration
 def run(arguments):
     """Print the table, draw the figure and write what was asked for."""
     asked = (arguments.altitude, arguments.parallactic, arguments.derotator, arguments.wavelength)
-    planned = bool(arguments.target or arguments.night)
+    planned = bool(arguments.target)
     # a target has its own pointing, not that of the table
     tabulated = not planned or any(a is not None for a in asked)
     arguments.altitude = 60.0 if arguments.altitude is None else arguments.altitude
@@ -223,8 +223,6 @@ def _rows(wanted, grid):
 
 def _best(arguments, instrument, chain, grid):
     """Return the statements on the best derotator offset, and the same in words."""
-    if not (arguments.target and arguments.night):
-        raise ParameterError("--target and --night belong together")
     if instrument.location is None:
         raise InstrumentError(f"{instrument.name}: its site is not known")
     target = common.sky_position(arguments.target, "--target")

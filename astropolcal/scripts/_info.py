@@ -37,7 +37,7 @@ from astropolcal.words import counted
 
 OPTIONS = """
 file FILE|DIR ? Input  ASDF calibration, folder of calibrations, ECSV table, or FITS cube or product
---instruments  list the instruments only
+--instruments not:file  list the instruments only
 --frame FILE Input  of a folder: which calibration holds for this frame, and why none of the others
 --context NAME  of a folder: the files of this context only
 @ full json quiet
@@ -59,8 +59,6 @@ _FITS_NAMES = (".fits", ".fit", ".fts", ".fits.gz", ".fits.fz")
 def run(arguments):
     """Print what the file holds."""
     path = arguments.file
-    if arguments.instruments and path is not None:
-        raise AstropolcalError(f"{path}: --instruments goes without a file")
     if arguments.instruments:
         common.say(arguments, *instruments.names())
         return

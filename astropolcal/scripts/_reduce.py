@@ -34,7 +34,7 @@ _MAX_LISTED = 20
 
 OPTIONS = """
 cubes CUBES + Frames  cubes, or folders of them (*.fits)
--o --output OBS.ecsv Output  the table; overwritten if it exists
+-o --output OBS.ecsv Output not:archive  the table; overwritten if it exists
 --instrument NAME  default: the one that the headers name, else charis
 --raw DIR Frames  folder of raw frames, for keywords that the cubes lack
 --dark FILE Input  raw frames: dark that is subtracted (FITS); of two cameras the file of the right
@@ -52,8 +52,8 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 --aperture-correction  stars: scale the fluxes to all of the star's light, by a profile of its wings
 --workers N int  number of processes
 --cluster ADDRESS  scheduler of dask.distributed, in place of processes
---resume FILE Continued  journal of what is done, to go on after a stop
---quicklook DIR Folder  write figures to this folder
+--resume FILE Continued not:archive  journal of what is done, to go on after a stop
+--quicklook DIR Folder not:archive  write figures to this folder
 @ full json online quiet
 [whole archives]
 @ archive gap cycles target retry timeout
@@ -73,7 +73,7 @@ TYPES = {"pair": common.text_type("KEY=VALUE", _pair), "radius": common.number_o
 def run(arguments):
     """Reduce the cubes, or the archive, and write the table."""
     _options(arguments)
-    if is_archive(arguments, ("resume", "quicklook")):
+    if is_archive(arguments):
         return run_archive("reduce", arguments)
     common.check_suffix("-o", arguments.output, ".ecsv")
     return work(arguments)

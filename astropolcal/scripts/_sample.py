@@ -40,7 +40,7 @@ files FILE + Input  the tables that it was made from (ECSV)
 --burn N|auto burn_in  steps to leave out at the start (default: auto, 5 autocorrelation times)
 --seed N int  makes the run repeatable
 --checkpoint FILE.h5 Continued  write the steps here while the run lasts
---resume  go on from the checkpoint, if there is one
+--resume needs:checkpoint  go on from the checkpoint, if there is one
 @ plots full json online quiet
 """
 # the samples come to what the calibration holds, and nothing of it is lost
@@ -78,8 +78,6 @@ def run(arguments):
 
 def _check_options(arguments):
     """Raise before the long work is done."""
-    if arguments.resume and not arguments.checkpoint:
-        raise AstropolcalError("--resume needs --checkpoint FILE.h5")
     if arguments.seed is not None and arguments.seed < 0:
         raise AstropolcalError(f"--seed {arguments.seed}: allowed are whole numbers from 0 up")
     # a run of days must not be overwritten by a typo

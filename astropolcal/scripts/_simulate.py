@@ -27,29 +27,10 @@ from astropolcal.words import counted
 #: What the packaged example was made with.
 EXAMPLE = {"flux": 4e6, "gain": 1.0, "read_noise": 100.0, "seed": 20251005}
 
-
-# what of the options of --cubes tells of the image, the rest of the detector
+# what of the options of --cubes tells of the image, and what of the detector
 _IMAGE = ("psf", "fwhm", "halo", "motion", "seeing")
+_DETECTOR = ("background", "bad_pixels", "flat_error", "saturate")
 _DEROTATOR = [45 + 12.5 * i for i in range(8)]
-
-#: Options of image cubes, which do nothing without ``--cubes``.
-_IMAGES = """
---psf {moffat,gaussian} =moffat  profile of a star's core (default: %(default)s)
---fwhm PIX float =5  full width of a star's core at half maximum (default: %(default)g)
---halo SHARE float =0  share of a star's light in its halo (default: %(default)g)
---motion PIX float =0  standard deviation of a star's place from frame to frame (default:
-    %(default)g)
---seeing PART float =0  relative standard deviation of its width (default: %(default)g)
---background ADU float =0  of each pixel (default: %(default)g)
---bad-pixels SHARE float =0  share of the pixels without a value (default: %(default)g)
---flat-error PART float =0  relative standard deviation of the pixels' response (default:
-    %(default)g)
---saturate  cut pixels off at the instrument's saturation
-"""
-_USUAL = {
-    flags[0].removeprefix("--").replace("-", "_"): settings.get("default", False)
-    for flags, settings in (common.option(entry, {}) for entry in common.entries(_IMAGES))
-}
 OPTIONS = f"""
 -o --output OBS.ecsv Output  the table (required without --cubes; with it, the true fluxes);
     overwritten if it exists
@@ -74,7 +55,17 @@ OPTIONS = f"""
 @ json quiet
 [image cubes]
 --cubes DIR Folder  write image cubes to this folder, raw headers to DIR/raw
-{_IMAGES.strip()}
+--psf {{moffat,gaussian}} =moffat needs:cubes  profile of a star's core (default: %(default)s)
+--fwhm PIX float =5 needs:cubes  full width of a star's core at half maximum (default: %(default)g)
+--halo SHARE float =0 needs:cubes  share of a star's light in its halo (default: %(default)g)
+--motion PIX float =0 needs:cubes  standard deviation of a star's place from frame to frame
+    (default: %(default)g)
+--seeing PART float =0 needs:cubes  relative standard deviation of its width (default: %(default)g)
+--background ADU float =0 needs:cubes  of each pixel (default: %(default)g)
+--bad-pixels SHARE float =0 needs:cubes  share of the pixels without a value (default: %(default)g)
+--flat-error PART float =0 needs:cubes  relative standard deviation of the pixels' response
+    (default: %(default)g)
+--saturate needs:cubes  cut pixels off at the instrument's saturation
 """
 
 
@@ -86,9 +77,6 @@ def run(arguments):
     if not (arguments.output or arguments.cubes):
         raise AstropolcalError("nothing to write: give -o OBS.ecsv, --cubes DIR or both")
     common.check_suffix("-o", arguments.output, ".ecsv")
-    for name, default in _USUAL.items():
-        if not arguments.cubes and getattr(arguments, name) != default:
-            raise AstropolcalError(f"{common.label_of(name)}: is for --cubes DIR")
     instrument, chain, wavelength, meta = _truth(arguments)
     # free and prior mean nothing for what is true
     (chain,) = common.edit_chains([chain], without=arguments.without, fix=arguments.fix)
@@ -114,7 +102,7 @@ def run(arguments):
         observations = true_observations(chain, instrument, frames, **scene, **options)
     written = []
     if arguments.cubes:
-        response = {name: getattr(arguments, name) for name in _USUAL if name not in _IMAGE}
+        response = {name: getattr(arguments, name) for name in _DETECTOR}
         detector = DetectorModel(noise=not arguments.no_noise, **response)
         cubes = {"image": image, "detector": detector} | {k: given[k] for k in ("flux", "seed")}
         paths = simulate_cubes(arguments.cubes, chain, instrument, frames, **cubes, **scene)

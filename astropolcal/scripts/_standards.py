@@ -26,17 +26,17 @@ from astropolcal.words import counted, did_you_mean, with_error
 
 OPTIONS = """
 name NAME ?  a star, such as 'HD 293396'
---kind {polarized,unpolarized}  only stars of this kind
---band BAND  magnitude and polarization in this band, such as H; the magnitude in V where the
+--kind {polarized,unpolarized} not:name  only stars of this kind
+--band BAND not:name  magnitude and polarization in this band, such as H; the magnitude in V where
+    the catalogue has none in it
+--magnitude LO,HI pair not:name  brightest and faintest magnitude, in --band, or in V where the
     catalogue has none in it
---magnitude LO,HI pair  brightest and faintest magnitude, in --band, or in V where the catalogue has
-    none in it
---near RA,DEC  degrees, or 05:26:06,+16:42:00
---radius DEG float  goes with --near (default: 15)
---site SITE  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
---night YYYY-MM-DD  date of the evening at the site
---min-altitude DEG float  goes with --night: lowest altitude (default: 30)
---limit N int  how many to list, the best first (default: 20 of a night, else all)
+--near RA,DEC not:name  degrees, or 05:26:06,+16:42:00
+--radius DEG float needs:near  goes with --near (default: 15)
+--site SITE needs:night  subaru, keck, paranal, gemini_south or LON,LAT,HEIGHT
+--night YYYY-MM-DD needs:site  date of the evening at the site
+--min-altitude DEG float needs:night  goes with --night: lowest altitude (default: 30)
+--limit N int not:name  how many to list, the best first (default: 20 of a night, else all)
 @ json online quiet
 """
 TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.numbers, 2)}
@@ -44,26 +44,12 @@ TYPES = {"pair": common.text_type("2 numbers with a comma between them", common.
 
 def run(arguments):
     """Print the stars."""
-    _check(arguments)
+    if arguments.limit is not None and arguments.limit < 1:
+        raise ParameterError(f"--limit {arguments.limit}: allowed are whole numbers from 1 up")
     if arguments.min_altitude is None:
         arguments.min_altitude = 30.0
     lines, content = (_one if arguments.name else _many)(arguments)
     common.give(arguments, lines, content)
-
-
-def _check(arguments):
-    """Refuse options that lack their companion or do nothing."""
-    if (arguments.site is None) != (arguments.night is None):
-        raise ParameterError("--site and --night go together")
-    if arguments.min_altitude is not None and arguments.night is None:
-        raise ParameterError("--min-altitude needs --site and --night")
-    if arguments.radius is not None and arguments.near is None:
-        raise ParameterError("--radius goes with --near RA,DEC")
-    if arguments.limit is not None and arguments.limit < 1:
-        raise ParameterError(f"--limit {arguments.limit}: allowed are whole numbers from 1 up")
-    for option in ("kind", "band", "magnitude", "near", "limit"):
-        if arguments.name and getattr(arguments, option) is not None:
-            raise ParameterError(f"--{option} selects among stars; it does not go with a NAME")
 
 
 # ---- one star -----------------------------------------------------------------------

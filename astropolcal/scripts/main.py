@@ -56,6 +56,8 @@ class _OneLineParser(argparse.ArgumentParser):
             self.register("type", kind, partial(plain_number, kind=kind))
 
     def parse_known_args(self, args=None, namespace=None):
+        from astropolcal.scripts._common import check_together
+
         namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             # here, where the command is known: argparse complains in the name of the whole program
@@ -63,6 +65,7 @@ class _OneLineParser(argparse.ArgumentParser):
             # two dashes alone make short names alike
             hint = did_you_mean(name, self._option_string_actions, cutoff=0.75)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        check_together(self._actions, namespace)
         return namespace, unknown
 
     def error(self, message):

@@ -1,6 +1,8 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """What an instrument gets from its base class: choices, grids, sources, and the way to the sky."""
 
+import pickle
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -327,3 +329,9 @@ def test_both_polarimeters_of_subaru_have_one_unit_and_one_site():
     for source in ("polarized", "unpolarized"):
         a, b = (leaves(i.chain(source))[0] for i in (charis, vampires))
         assert (type(a), a.name, a.theta.bounds) == (type(b), b.name, b.theta.bounds)
+
+
+def test_wavelengths_go_to_other_processes():
+    for name in instruments.names():
+        lam = instruments.get(name).wavelength
+        assert np.array_equal(pickle.loads(pickle.dumps(lam)), lam), name

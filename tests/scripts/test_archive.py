@@ -348,16 +348,28 @@ def test_bad_input(lab, tmp_path, capsys):
     out = ["--archive", tmp_path / "out"]
     for words, message in (
         (["correct", tree, *calibration], "-o FILE is needed, or --archive DIR"),
-        (["correct", tree, *calibration, "-o", "a.fits", "--retry"], "--retry: is for --archive"),
-        (["correct", tree, *calibration, *out, "-o", "a.fits"], "-o a.fits: names one file"),
-        (["correct", tree, *calibration, *out, "--plot", "a.png"], "--plot a.png: names one file"),
+        (["correct", tree, *calibration, "-o", "a.fits", "--retry"], "--retry needs --archive"),
+        (
+            ["correct", tree, *calibration, *out, "-o", "a.fits"],
+            "-o a.fits cannot be combined with",
+        ),
+        (
+            ["correct", tree, *calibration, *out, "--plot", "a.png"],
+            "--plot a.png cannot be combined",
+        ),
         (["correct", tree, tree, *calibration, *out], "--archive takes one folder"),
         (["correct", tree, *calibration, *out, "--gap", "0"], "--gap 0: a number above zero"),
         (["correct", tree, *calibration, *out, "--target", "x"], "no sequence in it"),
         (["correct", tmp_path / "empty", *calibration, *out], "no FITS file in this folder"),
         (["correct", tmp_path / "none", *calibration, *out], "no such folder"),
-        (["reduce", tree, *out, "--quicklook", tmp_path / "q"], "--quicklook"),
-        (["correct", tree, *calibration, "-o", "a.fits", "--timeout", "1"], "is for --archive"),
+        (
+            ["reduce", tree, *out, "--quicklook", tmp_path / "q"],
+            "q cannot be combined with --archive DIR",
+        ),
+        (
+            ["correct", tree, *calibration, "-o", "a.fits", "--timeout", "1"],
+            "1 needs --archive DIR",
+        ),
     ):
         assert main(list(map(str, words))) == 2
         lines = capsys.readouterr().err.splitlines()

@@ -448,7 +448,7 @@ def test_start_on_bad_input(tables, tmp_path, capsys):
     for more, complaint in [
         ([], "say with --free NAME what may change"),
         (["--free", "hwp", "--fix", "hwp.theta"], "--fix cannot be combined with --start"),
-        (["--free", "hwp", "--bounds", "paper"], "--bounds cannot be combined with --start"),
+        (["--free", "hwp", "--bounds", "paper"], "--bounds paper cannot be combined with --start"),
         (["--free", "hwp", "--strategy", "two-step"], "--strategy two-step cannot be combined"),
         (["--free", "m9"], "free: no 'm9' in the chains; optics are calibration_polarizer"),
         (["--free", "hwp"], r"none.asdf: no such file"),

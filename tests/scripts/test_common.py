@@ -48,6 +48,7 @@ from astropolcal.scripts._common import (
     wrapped,
     write_json,
 )
+from astropolcal.scripts.main import main
 
 
 @pytest.fixture
@@ -447,3 +448,17 @@ def test_a_value_is_of_one_parameter():
     edit_chains(chains, fix=["derotator"])
     assert chains[0]["derotator"].theta.fixed
     assert chains[0]["derotator"].retardance.fixed
+
+
+def test_the_table_of_options_says_what_goes_together(capsys):
+    for argv, words in [
+        (["simulate", "-o", "x.ecsv", "--halo", "0.1"], "--halo 0.1 needs --cubes DIR"),
+        (["standards", "--site", "subaru"], "--site subaru needs --night YYYY-MM-DD"),
+        (["standards", "HD 30675", "--limit", "2"], "--limit 2 cannot be combined with NAME"),
+        (["info", "x.asdf", "--instruments"], "--instruments cannot be combined with FILE|DIR"),
+        (["calibrate", "--start", "a.asdf", "--fix", "hwp"], "--fix cannot be combined with --sta"),
+        # what is typed as it is without being typed contradicts nothing
+        (["simulate", "-o", "nowhere/x.ecsv", "--halo", "0"], "there is no folder nowhere"),
+    ]:
+        assert main(argv) == 2, argv
+        assert words in capsys.readouterr().err, argv

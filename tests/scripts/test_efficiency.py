@@ -128,7 +128,7 @@ def test_unknown_format_of_the_figure_is_refused(tmp_path):
 @pytest.mark.slow
 def test_bad_input_is_one_error():
     for argv, error, words in [
-        (["--target", "72.7,28.3"], ParameterError, "--target and --night belong together"),
+        (["--target", "72.7,28.3"], ParameterError, "--target 72.7,28.3 needs --night START/END"),
         (["--target", "x", "--night", NIGHT], ParameterError, "give RA,DEC in degrees"),
         (["--target", "1,2", "--night", "yesterday"], ParameterError, "START/END"),
         (

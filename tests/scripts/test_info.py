@@ -88,7 +88,7 @@ def test_options_of_a_folder_do_nothing_in_silence_nowhere(folder, capsys):
     for words, told in (
         (["--frame", "a.fits"], "--frame and --context need a folder of calibrations"),
         (["--context", "now"], "--frame and --context need a folder of calibrations"),
-        (["--instruments", OLD], "--instruments goes without a file"),
+        (["--instruments", OLD], "--instruments cannot be combined with FILE|DIR"),
         ([OLD, "--frame", "a.fits"], "need a folder of calibrations"),
         # of a terminal's options there is none for its instrument
         (

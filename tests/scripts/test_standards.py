@@ -91,8 +91,8 @@ def test_json_of_many_to_the_standard_output(capsys):
 def test_bad_input_is_refused_with_what_is_allowed(tmp_path, monkeypatch):
     for argv, words in [
         (["HD 30676"], "did you mean HD 30675"),
-        (["HD 30675", "--kind", "polarized"], "--kind selects among stars"),
-        (["HD 30675", "--site", "subaru"], "go together"),
+        (["HD 30675", "--kind", "polarized"], "--kind polarized cannot be combined with NAME"),
+        (["HD 30675", "--site", "subaru"], "--site subaru needs --night YYYY-MM-DD"),
         (["HD 30675", "--site", "subaru", "--night", "2025-02-30"], "night = '2025-02-30'"),
         (["HD 30675", "--site", "atlantis", "--night", "2025-11-03"], "--site atlantis: not known"),
         (["--site", "3", "--night", "2025-11-03"], "--site 3: .*, or LON,LAT,HEIGHT in deg, deg"),
@@ -102,9 +102,9 @@ def test_bad_input_is_refused_with_what_is_allowed(tmp_path, monkeypatch):
         (["Cha F7", *NIGHT], "does not rise above 30 deg"),
         (["--magnitude", "30,31"], "no standard star fits"),
         (["--near=0,-80", *NIGHT], "no standard star above 30 deg"),
-        (["--radius", "5"], "--radius goes with --near"),
-        (["--min-altitude", "30"], "--min-altitude needs --site and --night"),
-        (["HD 30675", "--band", "H"], "--band selects among stars"),
+        (["--radius", "5"], "--radius 5 needs --near RA,DEC"),
+        (["--min-altitude", "30"], "--min-altitude 30 needs --night"),
+        (["HD 30675", "--band", "H"], "--band H cannot be combined with NAME"),
         (["--near", "north"], "--near north"),
         (["--near", "400,0"], "--near 400,0: .* a right ascension from -360 to 360 deg"),
         (["--band", "Z"], "band = 'Z'"),
@@ -176,7 +176,7 @@ def test_impossible_limits():
     for argv, words in [
         (["--limit", "0"], "--limit 0: allowed are whole numbers from 1 up"),
         (["--limit", "-2"], "--limit -2"),
-        (["HD 30675", "--limit", "2"], "--limit selects among stars; it does not go with a NAME"),
+        (["HD 30675", "--limit", "2"], "--limit 2 cannot be combined with NAME"),
     ]:
         with pytest.raises(ParameterError, match=words):
             call(*argv)
