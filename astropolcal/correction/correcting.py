@@ -31,8 +31,9 @@ MODES = ("stokes", "ip")
 _LEAKS = 0.3
 # by how much, and how many times its scatter, a frame is brighter at one wavelength than at others
 _UNEVEN, _BEYOND = 0.05, 10.0
-# times the stated errors, from which on an error that the scatter of the frames shows is told
-_BEYOND_ERRORS = 3.0
+# times the stated errors, from which on an error that the scatter of the frames shows is told; and
+# that of one alone, so many times farther off than the others, of at least so many
+_BEYOND_ERRORS, _ONE_ALONE, _APART, _OTHERS = 3.0, 1.0, 6.0, 2
 # of I: what the sums of differences of pairs vary by in real stars, gains not being quite steady
 _UNSTEADY = 0.005
 # what a result keeps of the solution and of the frames
@@ -449,16 +450,28 @@ def _beyond(what, names, off, noise, free, own, known, least=0.0):
         share = error / (error + systematic)
         beyond = square.sum(axis=0) @ share - 4 * np.sqrt(2 * number @ share**2)
         beyond = max(beyond, 0.0) / number.sum()
-        real = np.where(each, each**2 - spread, 0.0).sum() / number.sum()
-        if beyond > _BEYOND_ERRORS**2 and real > least**2:
-            usual = 100 * np.sqrt(np.median(error + systematic))
-            return [
-                "the frames disagree: "
-                f"{what.format(100 * np.sqrt((each**2).sum() / number.sum()))}, "
-                f"{np.sqrt(square.sum() / number.sum()):.2g} times their noise{of}, most those of "
-                f"{names[np.argmax(square.sum(axis=1))]}; q and u may be wrong by "
-                f"{usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too small"
-            ]
+        real = np.where(each, each**2 - spread, 0.0)
+        told, count = np.arange(len(each)), number.sum()
+        if beyond <= _BEYOND_ERRORS**2 or real.sum() <= count * least**2:
+            if number.min() <= _OTHERS:
+                continue
+            # one that is off draws the solution to itself
+            alone = (square * np.count_nonzero(each, axis=0) / number) @ share
+            told, count = [np.argmax(alone)], number.size
+            rest = (square.sum(axis=0) @ share - alone.max()) / ((number - 1) @ share)
+            beyond = alone.max() / number.sum()
+            apart = alone.max() > _APART**2 * max(rest, 1.0) * share.sum()
+            if not apart or beyond <= _ONE_ALONE or real[told].sum() <= count * least**2:
+                continue
+        usual = 100 * np.sqrt(np.median(error + systematic))
+        return [
+            "the frames disagree: "
+            f"{what.format(100 * np.sqrt((each[told] ** 2).sum() / count))}, "
+            f"{np.sqrt(square[told].sum() / count):.2g} times their noise{of}, most those of "
+            f"{names[told[np.argmax(square[told].sum(axis=1))]]}; q and u may be "
+            f"wrong by {usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too "
+            "small"
+        ]
     return []
 
 
