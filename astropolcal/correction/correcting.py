@@ -34,6 +34,8 @@ _UNEVEN, _BEYOND = 0.05, 10.0
 # times the stated errors, from which on an error that the scatter of the frames shows is told; and
 # that of one alone, so many times farther off than the others, of at least so many
 _BEYOND_ERRORS, _ONE_ALONE, _APART, _OTHERS = 3.0, 1.0, 6.0, 2
+# times the light of one beam that the other one may have beyond what the optics let expect
+_UNEQUAL = 2.0
 # of I: what the sums of differences of pairs vary by in real stars, gains not being quite steady
 _UNSTEADY = 0.005
 # what a result keeps of the solution and of the frames
@@ -202,6 +204,7 @@ def correct(
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
     unmeasured += _of_errors(systematic, by_variance, frames.source)
+    unmeasured += _unequal(solution, given)
     unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
@@ -375,6 +378,26 @@ def _uneven(frames):
         f"the others, most {frames.names[f]} at {frames.wavelength[w]:.6g}, by "
         f"{100 * apart[w, f]:+.2g} %, which changes q and u of all pixels there; mask cosmic rays "
         "and bad pixels (NaN)"
+    ]
+
+
+def _unequal(solution, frames):
+    """Say that one beam has far more light, in all frames together, than the solution says."""
+    if frames.groups is not None:
+        # of single beams
+        return []
+    light = np.nan_to_num(frames._light[0])
+    stokes = np.nan_to_num(solution.apply(light))
+    expected = np.einsum("bwfs,sw->bw", solution.rows[..., : len(stokes)], stokes)
+    right, left = light.sum(axis=1) * expected[::-1]
+    good = (right > 0) & (left > 0)
+    ratio = np.median(right[good] / left[good]) if good.any() else 1.0
+    if 1 / _UNEQUAL < ratio < _UNEQUAL:
+        return []
+    return [
+        f"the right beam has {ratio:.2g} times the light of the left one, beyond what the optics "
+        "make of it, so that q and u are too small: is BUNIT, the gain or the exposure time of one "
+        "of them wrong?"
     ]
 
 
