@@ -181,7 +181,7 @@ def test_a_bias_of_one_beam_in_some_frames_is_told(science, tmp_path, capsys):
     data = simulate(chain, LAM, frames, flux=1e8, seed=1)
     calibrate(chain, data, instrument="irdis").write(cal)
     paths, found = copied(science, tmp_path), []
-    images, words = [fits.getdata(path) for path in paths], "edge of the images is polarized other"
+    images, words = [fits.getdata(path) for path in paths], "edge of the images is polarized diff"
     command = ["correct", *map(str, paths), "--calibration", str(cal), "--any-date", "-q"]
     command += ["-o", str(tmp_path / "out.fits"), "--json", str(tmp_path / "s.json")]
     command += ["--rotation", "fixed", "--open-directions", "ignore"]

@@ -166,10 +166,11 @@ def correct(
     AstropolcalWarning
         If the calibration is not usable, as its verdict says; the frames have no pairs, or some
         have none, where pairs are to be fitted; their brightness cannot be measured, or differs at
-        one wavelength from others; they disagree by more than all errors allow for; variances as
-        weights follow the measured fluxes; combinations
-        of Stokes parameters are poorly determined at some wavelengths; the calibration does not
-        determine how they change; it is old; or a spectrum is polarized by more than 100 %.
+        one wavelength from others; they disagree by more than all errors allow for; one beam has
+        more than twice the light of the other; variances as weights follow the measured fluxes;
+        combinations of Stokes parameters are poorly determined at some wavelengths; the calibration
+        does not determine how they change; it is old; or a spectrum is polarized by more than
+        100 %.
 
     Examples
     --------

@@ -304,7 +304,7 @@ def _warn_of_sky(images, star, errors, radius):
     told = off * (off > np.maximum(errors[:, good], least))
     if np.median(told.max(axis=0)):
         warn(
-            "the edge of the images is polarized otherwise than the star: on the area of the "
+            "the edge of the images is polarized differently from the star: on the area of the "
             f"aperture this changes q or u by {100 * np.median(told.max(axis=0)):.2g} %, more than "
             "their errors; a sky background, or a bias of one beam or of some frames, must be "
             "subtracted from the cubes before"
