@@ -204,8 +204,7 @@ def correct(
     how["weights"] = None if by_variance else weights
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    unmeasured += _of_errors(systematic, by_variance, frames.source)
-    unmeasured += _unequal(solution, given)
+    unmeasured += _of_errors(systematic, by_variance, frames.source) + _unequal(solution, given)
     unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
