@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from astropolcal import instruments
+from astropolcal import calibrate, instruments
 from astropolcal.correction import Corrected, measurement_rows
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments import IRDIS
@@ -23,7 +23,7 @@ from astropolcal.reduction import (
 from astropolcal.reduction.frames import survey_frames
 from astropolcal.reduction.headers import read_header
 from astropolcal.scripts.main import main
-from astropolcal.simulation import half_wave_plate_cycles
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 IRDIS_ = instruments.get("irdis")
 SIDE, LAM = 64, [1.625] * u.um
@@ -170,6 +170,39 @@ def test_frames_of_a_lamp_calibrate(lamp):
         off = getattr(table, beam) - getattr(truth, beam)
         pulls = off / np.sqrt(getattr(table, beam.replace("flux", "variance")))
         assert np.sqrt(np.mean(pulls**2)) == pytest.approx(1, abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("always::astropolcal.exceptions.AstropolcalWarning")
+def test_a_bias_of_one_beam_in_some_frames_is_told(science, tmp_path, capsys):
+    """It looks like polarization of the star; not a bias of all, nor one below the errors."""
+    chain, cal = IRDIS_.chain(wavelength=LAM), tmp_path / "irdis.asdf"
+    frames = half_wave_plate_cycles(derotator=[10, 35, 60] * u.deg)
+    data = simulate(chain, LAM, frames, flux=1e8, seed=1)
+    calibrate(chain, data, instrument="irdis").write(cal)
+    paths, found = copied(science, tmp_path), []
+    images, words = [fits.getdata(path) for path in paths], "edge of the images is polarized diff"
+    command = ["correct", *map(str, paths), "--calibration", str(cal), "--any-date", "-q"]
+    command += ["-o", str(tmp_path / "out.fits"), "--json", str(tmp_path / "s.json")]
+    command += ["--rotation", "fixed", "--open-directions", "ignore"]
+    # of left and right beam where the plate is at 0 and 22.5 deg, and where it is not
+    for first, second, odd in (
+        ((0, 0), (0, 0), False),
+        ((6, 6), (6, 6), False),
+        ((0, 1), (0, 0), False),
+        ((0, -30), (0, 0), True),
+    ):
+        for i, (path, image) in enumerate(zip(paths, images, strict=True)):
+            bias = np.repeat(second if i % 2 else first, SIDE)
+            with fits.open(path, mode="update") as hdus:
+                hdus[0].data = (image + bias).astype(np.float32)
+        assert main(command) in (0, None)
+        told = words in capsys.readouterr().err
+        aperture = json.loads((tmp_path / "s.json").read_text())["aperture"]
+        found.append(np.array([aperture["q"][0], aperture["u"][0]]))
+        error = np.hypot(aperture["q_statistical"], aperture["q_systematic"])[0]
+        changed = np.hypot(*(found[-1] - found[0])) > 1.5 * error
+        assert (changed, told) == (odd, odd), (first, second)
 
 
 @pytest.mark.slow

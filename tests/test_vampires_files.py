@@ -2,6 +2,8 @@
 """VAMPIRES: headers, detectors, files of two cameras, and a run from cubes to the truth."""
 
 import json
+import re
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -12,6 +14,8 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
+from astropolcal.chain import join, leaves
+from astropolcal.correction import ScienceFrames, correct
 from astropolcal.exceptions import InstrumentError, ObservationError
 from astropolcal.instruments.layout import FileLayout, ReadOut
 from astropolcal.instruments.vampires import layout_of, slices_of
@@ -551,3 +555,25 @@ def test_whole_numbers_of_a_camera_are_read_and_need_a_dark(raw, tmp_path):
     found = reduced(raw, dark=tmp_path / "dark_cam1.fits")
     assert found.doubts == {}
     np.testing.assert_allclose(found.observations.flux_right, wanted.flux_right, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_camera_in_a_wrong_unit_is_told_by_the_light_of_both(copied):
+    """Its electrons would be ten times as many, and what is polarized seem less so."""
+    optics, words = join(leaves(chain())[1:]), "beam has .* times the light of the left one"
+    for unit, odd in (("adu", False), ("electron", True)):
+        for path in copied.glob("*_cam2.fits"):
+            edit(path, BUNIT=unit)
+        reduction = reduced(copied)
+        told = [one for why in reduction.doubts.values() for one in why if re.search(words, one)]
+        assert len(told) == odd * len(reduction.frames), (unit, told)
+        table = reduction.table
+        positions = {name: table[name].quantity for name in ("hwp", "derotator")}
+        positions["flc_state"] = (table["flc_state"] == "B").astype(float)
+        right, left = (table[f"flux_{beam}"].value[:, None] for beam in ("right", "left"))
+        frames = ScienceFrames.from_arrays(right, left, FILTER, positions, hwp=positions["hwp"])
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            found = correct(optics, frames)
+        assert (np.hypot(found.q, found.u)[0] < 0.9) == odd, unit
+        assert any(re.search(words, str(one.message)) for one in told) == odd, unit

@@ -31,8 +31,11 @@ MODES = ("stokes", "ip")
 _LEAKS = 0.3
 # by how much, and how many times its scatter, a frame is brighter at one wavelength than at others
 _UNEVEN, _BEYOND = 0.05, 10.0
-# times the stated errors, from which on an error that the scatter of the frames shows is told
-_BEYOND_ERRORS = 3.0
+# times the stated errors, from which on an error that the scatter of the frames shows is told; and
+# that of one alone, so many times farther off than the others, of at least so many
+_BEYOND_ERRORS, _ONE_ALONE, _APART, _OTHERS = 3.0, 1.0, 6.0, 2
+# times the light of one beam that the other one may have beyond what the optics let expect
+_UNEQUAL = 2.0
 # of I: what the sums of differences of pairs vary by in real stars, gains not being quite steady
 _UNSTEADY = 0.005
 # what a result keeps of the solution and of the frames
@@ -163,10 +166,11 @@ def correct(
     AstropolcalWarning
         If the calibration is not usable, as its verdict says; the frames have no pairs, or some
         have none, where pairs are to be fitted; their brightness cannot be measured, or differs at
-        one wavelength from others; they disagree by more than all errors allow for; variances as
-        weights follow the measured fluxes; combinations
-        of Stokes parameters are poorly determined at some wavelengths; the calibration does not
-        determine how they change; it is old; or a spectrum is polarized by more than 100 %.
+        one wavelength from others; they disagree by more than all errors allow for; one beam has
+        more than twice the light of the other; variances as weights follow the measured fluxes;
+        combinations of Stokes parameters are poorly determined at some wavelengths; the calibration
+        does not determine how they change; it is old; or a spectrum is polarized by more than
+        100 %.
 
     Examples
     --------
@@ -200,7 +204,7 @@ def correct(
     how["weights"] = None if by_variance else weights
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    unmeasured += _of_errors(systematic, by_variance, frames.source)
+    unmeasured += _of_errors(systematic, by_variance, frames.source) + _unequal(solution, given)
     unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
@@ -377,6 +381,26 @@ def _uneven(frames):
     ]
 
 
+def _unequal(solution, frames):
+    """Say that one beam has far more light, in all frames together, than the solution says."""
+    if frames.groups is not None:
+        # of single beams
+        return []
+    light = np.nan_to_num(frames._light[0])
+    stokes = np.nan_to_num(solution.apply(light))
+    expected = np.einsum("bwfs,sw->bw", solution.rows[..., : len(stokes)], stokes)
+    right, left = light.sum(axis=1) * expected[::-1]
+    good = (right > 0) & (left > 0)
+    ratio = np.median(right[good] / left[good]) if good.any() else 1.0
+    if 1 / _UNEQUAL < ratio < _UNEQUAL:
+        return []
+    return [
+        f"the right beam has {ratio:.2g} times the light of the left one, beyond what the optics "
+        "make of it, so that q and u are too small: is BUNIT, the gain or the exposure time of one "
+        "of them wrong?"
+    ]
+
+
 def _disagreement(solution, frames, systematic):
     """Say that the light of the frames is off the solution by more than the errors allow for.
 
@@ -449,16 +473,28 @@ def _beyond(what, names, off, noise, free, own, known, least=0.0):
         share = error / (error + systematic)
         beyond = square.sum(axis=0) @ share - 4 * np.sqrt(2 * number @ share**2)
         beyond = max(beyond, 0.0) / number.sum()
-        real = np.where(each, each**2 - spread, 0.0).sum() / number.sum()
-        if beyond > _BEYOND_ERRORS**2 and real > least**2:
-            usual = 100 * np.sqrt(np.median(error + systematic))
-            return [
-                "the frames disagree: "
-                f"{what.format(100 * np.sqrt((each**2).sum() / number.sum()))}, "
-                f"{np.sqrt(square.sum() / number.sum()):.2g} times their noise{of}, most those of "
-                f"{names[np.argmax(square.sum(axis=1))]}; q and u may be wrong by "
-                f"{usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too small"
-            ]
+        real = np.where(each, each**2 - spread, 0.0)
+        told, count = np.arange(len(each)), number.sum()
+        if beyond <= _BEYOND_ERRORS**2 or real.sum() <= count * least**2:
+            if number.min() <= _OTHERS:
+                continue
+            # one that is off draws the solution to itself
+            alone = (square * np.count_nonzero(each, axis=0) / number) @ share
+            told, count = [np.argmax(alone)], number.size
+            rest = (square.sum(axis=0) @ share - alone.max()) / ((number - 1) @ share)
+            beyond = alone.max() / number.sum()
+            apart = alone.max() > _APART**2 * max(rest, 1.0) * share.sum()
+            if not apart or beyond <= _ONE_ALONE or real[told].sum() <= count * least**2:
+                continue
+        usual = 100 * np.sqrt(np.median(error + systematic))
+        return [
+            "the frames disagree: "
+            f"{what.format(100 * np.sqrt((each[told] ** 2).sum() / count))}, "
+            f"{np.sqrt(square[told].sum() / count):.2g} times their noise{of}, most those of "
+            f"{names[told[np.argmax(square[told].sum(axis=1))]]}; q and u may be "
+            f"wrong by {usual * np.sqrt(beyond):.2g} %, and their errors, {usual:.2g} %, are too "
+            "small"
+        ]
     return []
 
 

@@ -49,6 +49,9 @@ _UNLIKE_OTHERS = (
     "in a part of the rectangles the beams compare differently from the other frames, as where "
     "pixels are damaged or one beam is cut"
 )
+# times the light of one beam that the other one may have, in all frames together, and what is left
+# of the polarization in such a sum, at the most
+_UNEQUAL, _LEFT_OVER = 2.0, 0.3
 _OTHER_DAY = "taken more than a day from the middle of the run; the table states one date"
 
 
@@ -323,6 +326,7 @@ def reduce_run(
     seen, stated, wrong = _seen_source(frames, instrument), (meta or {}).get("source", source), []
     if {seen, stated} == {"polarized", "unpolarized"}:
         wrong = [f"source {stated!r} is stated, but the fluxes change with the plate as if {seen}"]
+    wrong += _unequal(frames, instrument)
     _doubt(frames, layout, lambda frame: [*wrong, *masters.doubts(frame.values, settings)])
     reduction.doubts = {f.path: f.doubts for f in frames if f.doubts}
     reduction.meta = _meta(frames, instrument, source, meta or {})
@@ -514,6 +518,23 @@ def _unlike_others(frames, layout):
     error = error * max(1.0, MAD_TO_SIGMA * np.ma.median(off / error))
     bad = (off > np.maximum(_UNLIKE[0], _UNLIKE[1] * error)).filled(False).any(axis=1)
     return [frame for frame, unlike in zip(frames, bad, strict=True) if unlike]
+
+
+def _unequal(frames, instrument):
+    """Say that one beam has far more light than the other, in a run that does not polarize it."""
+    layout, turns = instrument.files, [frame.values.get("hwp", np.nan) for frame in frames]
+    # a half-wave plate at t turns polarization by 2 t, which is half a turn at 45 deg
+    if not (layout.two_beams and abs(np.mean(np.exp(4j * np.radians(turns)))) < _LEFT_OVER):
+        return []
+    with np.errstate(all="ignore"):
+        flux = np.sum([np.where(f.photometry.failed, 0, f.photometry.flux) for f in frames], axis=0)
+        ratio = np.nanmedian(flux[0] / flux[1])
+    if not (ratio > _UNEQUAL or ratio < 1 / _UNEQUAL):
+        return []
+    return [
+        f"the right beam has {ratio:.2g} times the light of the left one in the sum of all frames, "
+        "so that they seem less polarized: BUNIT, gain or exposure time of one of them may be wrong"
+    ]
 
 
 def _seen_source(frames, instrument):

@@ -86,8 +86,9 @@ cubes CUBES + Frames  cubes, or folders of them (*.fits)
 [whole archives]
 @ archive gap cycles target retry timeout
 """
-# share of the light in the aperture that the edge of the images may have on its area
-_MOST_SKY = 0.01
+# share of the light in the aperture that the edge of the images may have on its area; that of its
+# Q and U which is not the star's, as of a disk or of speckles
+_MOST_SKY, _MOST_POLARIZED = 0.01, 5e-4
 # degrees by which a derotator may miss the law of what it is said to keep
 _OFF_LAW = 1.0
 # pixels by which images may move: about half the width of a star, which smears little
@@ -201,7 +202,9 @@ def work(arguments):
     )
     # for the report, too, not only for --spectrum; the star as it is
     star = result.aperture(_radius(arguments))
-    _warn_of_sky(result["I"], star["I"], _radius(arguments))
+    errors = [star.fractional_errors(kind) for kind in ("statistical", "systematic")]
+    errors = np.array([np.hypot(*(each[name] for each in errors)) for name in "qu"])
+    _warn_of_sky(result.stokes[:3], star.stokes[:3], np.nan_to_num(errors), _radius(arguments))
     if arguments.subtract_star is not None:
         result = result.without_star(**arguments.subtract_star)
     _write(result, star, arguments)
@@ -256,28 +259,52 @@ def _radius(arguments):
     return min(10.0, arguments.size / 2) if arguments.radius is None else arguments.radius
 
 
-def _warn_of_sky(images, light, radius):
-    """Warn of light at the edge of the images, more than a halo has, that the aperture has too."""
-    size = min(images.shape[1:])
+def _warn_of_sky(images, star, errors, radius):
+    """
+    Warn of light at the edge of the images that the aperture has too, and is not the star's.
+
+    More than a halo has, or of another polarization. ``images`` are I, Q and U, (3, n_wavelengths,
+    rows, columns), ``star`` those of the aperture, and ``errors`` those of its q and u.
+    """
+    size = min(images.shape[2:])
     if size < 3 * radius:
         # it is the star itself
         return
-    places = np.indices(images.shape[1:])
-    depth = np.minimum(places, np.subtract(images.shape[1:], 1)[:, None, None] - places).min(axis=0)
-    edge, inner = (images[:, depth == place] for place in (0, size // 6))
-    good = np.isfinite(edge).any(axis=1) & np.isfinite(inner).any(axis=1) & (light > 0)
+    places, area = np.indices(images.shape[2:]), np.pi * radius**2
+    depth = np.minimum(places, np.subtract(images.shape[2:], 1)[:, None, None] - places).min(axis=0)
+    edge, inner = (images[0][:, depth == place] for place in (0, size // 6))
+    good = np.isfinite(edge).any(axis=1) & np.isfinite(inner).any(axis=1) & (star[0] > 0)
+    if not good.any():
+        return
     level, inside = (np.nanmedian(ring[good], axis=1) for ring in (edge, inner))
-    noise = 5 * np.nanstd(edge[good], axis=1) / np.sqrt(np.isfinite(edge[good]).sum(axis=1))
+    light = star[0, good]
     # a halo falls by 1 / r or faster, to 2 / 3 from the inner ring to the edge
     sky = 3 * level - 2 * inside
-    share = np.where(level > noise, sky * np.pi * radius**2 / light[good], 0.0)
-    worst = max(share, default=0.0)
-    if worst > _MOST_SKY:
+    share = np.where(level > _far_off(edge[good]), sky * area / light, 0.0)
+    if max(share) > _MOST_SKY:
         warn(
-            f"the edge of the images has {100 * worst:.2g} % of the light within {radius:g} pixels "
-            "of the star, on the same area: a sky background changes I, and so q and u, and must "
-            "be subtracted from the cubes before"
+            f"the edge of the images has {100 * max(share):.2g} % of the light within {radius:g} "
+            "pixels of the star, on the same area: a sky background changes I, and so q and u, and "
+            "must be subtracted from the cubes before"
         )
+    outer = images[:, good][..., depth <= size // 6]
+    level = np.nanmedian(outer, axis=-1)
+    # a halo is polarized as its star
+    off = np.abs(level[1:] - star[1:, good] / light * level[0]) * area / light
+    least = np.maximum(_MOST_POLARIZED, _far_off(outer[1:]) * area / light)
+    told = off * (off > np.maximum(errors[:, good], least))
+    if np.median(told.max(axis=0)):
+        warn(
+            "the edge of the images is polarized differently from the star: on the area of the "
+            f"aperture this changes q or u by {100 * np.median(told.max(axis=0)):.2g} %, more than "
+            "their errors; a sky background, or a bias of one beam or of some frames, must be "
+            "subtracted from the cubes before"
+        )
+
+
+def _far_off(pixels):
+    """Return what a median of pixels, the last axis, is not off zero by noise."""
+    return 5 * np.nanstd(pixels, axis=-1) / np.sqrt(np.isfinite(pixels).sum(axis=-1))
 
 
 # ---- the calibration ------------------------------------------------------------------------

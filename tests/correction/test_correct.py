@@ -300,6 +300,33 @@ def test_exchanges_in_one_cycle_show_in_the_sums_of_pairs(sky, charis, track, se
                 assert set(odd[named]) == {True, False}, (one, odd)
 
 
+def test_one_frame_that_is_off_is_told_where_all_others_agree(sky, charis, track, seen):
+    """Of eight cycles, by some times the noise: not what scatters evenly by twice the noise."""
+    hwp, positions = track(8)
+    positions["derotator"] = np.repeat(np.linspace(55, 69, 8), 4) * u.deg
+    light = np.array([1e6, 2e4, 1e4])[:, None] * np.ones(22)
+    clean = seen(sky, positions, charis.wavelength, light)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        noise, frame = rng.standard_normal(clean.shape), rng.integers(32)
+        for scatter, size, odd in ((1, 0, False), (2, 0, False), (1, 5.5e-3, True)):
+            noisy = clean + scatter * np.sqrt(clean) * noise
+            noisy[0, frame] *= 1 + size
+            variances = dict(zip(("variance_right", "variance_left"), clean, strict=True))
+            frames = ScienceFrames.from_arrays(
+                *noisy, charis.wavelength, positions, hwp=hwp, **variances
+            )
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                found = correct(sky, frames)
+            told = [str(one.message) for one in told if "disagree" in str(one.message)]
+            error = found.fractional_errors()["q"][0] / np.sqrt(22)
+            off = np.hypot(found.q.mean() - 0.02, found.u.mean() - 0.01) / error
+            assert off < 8, (seed, scatter, size)
+            assert len(told) == odd, (seed, scatter, size, told)
+            assert all(f"frame {frame} " in one or f"frame {frame};" in one for one in told), told
+
+
 def test_a_spectrum_polarized_by_more_than_all_of_it_is_told(star, sky, charis, seen, track):
     positions = track(1)[1]
     for degree, odd in ((0.99, False), (1.2, True)):

@@ -656,21 +656,25 @@ def test_report_has_units():
 
 
 def test_light_at_the_edge_is_told():
-    images = np.zeros((2, 21, 21))
-    images[:, 10, 10] = 1e4
-    light = images[:, 10, 10] + [0, 100]
+    images = np.zeros((3, 2, 21, 21))
+    images[0, :, 10, 10] = 1e4
+    light = images[:, :, 10, 10].copy()
+    light[0, 1] += 100
     noise = np.random.default_rng(1).normal(0, 0.5, images.shape)
-    halo = 20 / np.hypot(*(np.indices((21, 21)) - 10.001))
+    halo = (
+        20 / np.hypot(*(np.indices((21, 21)) - 10.001)) * np.array([1, 0, 0])[:, None, None, None]
+    )
+    errors = np.full((2, 2), 1e-3)
     # noise, a halo and what no wavelength has are no sky
     for known in (noise, halo, halo**2, np.nan):
-        _correct._warn_of_sky(images + known, light, 5)
-    images[1] += 2
+        _correct._warn_of_sky(images + known, light, errors, 5)
+    images[0, 1] += 2
     # so near to the star the edge has light of its own
-    _correct._warn_of_sky(images, light, 8)
+    _correct._warn_of_sky(images, light, errors, 8)
     for known in (0, noise / 50):
         words = r"has 1\.6 % of the light within 5 pixels .* must be subtracted"
         with pytest.warns(AstropolcalWarning, match=words):
-            _correct._warn_of_sky(images + known, light, 5)
+            _correct._warn_of_sky(images + known, light, errors, 5)
 
 
 OLD = Path(__file__).parents[1] / "calibration" / "data" / "calibration-1.0.0.asdf"
