@@ -401,6 +401,29 @@ def test_a_fit_behind_a_mirror_creeps_to_its_minimum():
     assert squares[0] < squares[1] + 0.5, squares
 
 
+@pytest.mark.slow
+def test_another_minimum_that_the_data_do_not_exclude_is_named():
+    """Its axis is eleven standard errors from the truth, of which only priors know."""
+    chain, _, night = few_frames(
+        14,
+        calibration_polarizer__theta=90.348,
+        hwp__theta=-0.49,
+        hwp__retardance=[-169.7, -173.813],
+        derotator__theta=-0.787,
+        derotator__retardance=[293.641, 199.435],
+        relay__diattenuation=[0.054, 0.073],
+        relay__retardance=[110.584, 123.088],
+        flc__theta=5.479,
+        flc__retardance=[176.024, 184.488],
+        flc__switching_angle=42.771,
+        wollaston__efficiency=[0.907, 0.937],
+        cameras__imbalance=[0.085, 0.011],
+    )
+    found = calibrate(chain, night, cross_validate=False)
+    assert any("flc.theta: in another minimum" in one for one in found.identifiability.mirrors)
+    assert "another minimum" in found.verdict().words[0]
+
+
 @pytest.mark.long
 def test_no_fit_ends_where_half_a_wave_mirrors_the_liquid_crystal():
     runs = (MIRRORED, 1), (MIRRORED, 2), (MIRRORED_TWICE, 14), (FAR_SWITCHING, 2)
