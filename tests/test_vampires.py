@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from astropolcal import instruments
 from astropolcal.calibration import calibrate
+from astropolcal.calibration.fit.calibrate import fitted
 from astropolcal.calibration.fit.strategies import stands_out
 from astropolcal.exceptions import AstropolcalWarning, InstrumentError, ObservationError
 from astropolcal.measurement import Measurement
@@ -360,6 +361,67 @@ def test_a_wrong_minimum_stands_out():
     for values, expected in ((FAR_SWITCHING, False), (WRONG_SIGNS, True)):
         # the null channel that wrong signs predict is wrong, too, and no measure of the noise
         assert stands_out(Measurement(with_values(values), night)) is expected
+
+
+def few_frames(seed, **values):
+    """Where a fit of two fields starts, the truth, and three cycles of it."""
+    chain = VAMPIRES.chain(wavelength=VAMPIRES.wavelength[[0, 3]], derotator="linear")
+    truth = chain.copy()
+    for name, value in values.items():
+        optic, key = name.split("__")
+        getattr(truth[optic], key).value = value
+    cycles = both_states(half_wave_plate_cycles(derotator=[45, 70, 95] * u.deg))
+    settings = {"flux": 1e6, "seed": seed, "meta": VAMPIRES.published_meta()}
+    return chain, truth, simulate(truth, VAMPIRES.wavelength[[0, 3]], cycles, **settings)
+
+
+@pytest.mark.slow
+def test_a_fit_behind_a_mirror_creeps_to_its_minimum():
+    chain, truth, night = few_frames(
+        26,
+        calibration_polarizer__theta=89.037,
+        hwp__theta=-1.509,
+        hwp__retardance=[-151.749, -167.082],
+        derotator__theta=0.577,
+        derotator__retardance=[276.34, 178.646],
+        relay__diattenuation=[0.07, 0.002],
+        relay__retardance=[9.708, 16.23],
+        flc__theta=0.749,
+        flc__retardance=[174.985, 163.334],
+        flc__switching_angle=40.829,
+        wollaston__efficiency=[0.909, 0.953],
+        cameras__imbalance=[-0.052, 0.021],
+    )
+    at_truth = fitted(Measurement(truth, night), search=False).measurement
+    found = fitted(Measurement(chain, night)).measurement
+    squares = [
+        np.sum((one.residuals() / 1e-3) ** 2) + np.sum(one.free.prior_residuals(one.vector()) ** 2)
+        for one in (found, at_truth)
+    ]
+    assert squares[0] < squares[1] + 0.5, squares
+
+
+@pytest.mark.slow
+def test_another_minimum_that_the_data_do_not_exclude_is_named():
+    """Its axis is eleven standard errors from the truth, of which only priors know."""
+    chain, _, night = few_frames(
+        14,
+        calibration_polarizer__theta=90.348,
+        hwp__theta=-0.49,
+        hwp__retardance=[-169.7, -173.813],
+        derotator__theta=-0.787,
+        derotator__retardance=[293.641, 199.435],
+        relay__diattenuation=[0.054, 0.073],
+        relay__retardance=[110.584, 123.088],
+        flc__theta=5.479,
+        flc__retardance=[176.024, 184.488],
+        flc__switching_angle=42.771,
+        wollaston__efficiency=[0.907, 0.937],
+        cameras__imbalance=[0.085, 0.011],
+    )
+    found = calibrate(chain, night, cross_validate=False)
+    assert any("flc.theta: in another minimum" in one for one in found.identifiability.mirrors)
+    assert "another minimum" in found.verdict().words[0]
 
 
 @pytest.mark.long

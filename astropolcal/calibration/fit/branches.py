@@ -326,9 +326,11 @@ def _between(wavelength, phases):
     return found
 
 
-def undecided_signs(measurement, view, stds, lawful=()):
+def undecided_signs(measurement, view, stds, minima, lawful=()):
     """
     Return, as mirror solutions are, what the data do not tell the sign of, at single wavelengths.
+
+    And which of the ``minima`` that a search has seen elsewhere they do not exclude.
 
     These are phases, and diattenuations, of which the other sign, all else of the wavelength
     refitted, and of a few wavelengths everything, is less than three standard deviations worse, or
@@ -384,6 +386,43 @@ def undecided_signs(measurement, view, stds, lawful=()):
             if view is not None and np.any(share > 0):
                 other = seen_with(view, measurement.put_back(there))
                 errors = np.maximum(errors, share * mean_errors(view, other))
+    elsewhere, further = _elsewhere(measurement, view, stds, minima)
+    return found + elsewhere, np.maximum(errors, further)
+
+
+def _elsewhere(measurement, view, stds, minima):
+    """Return minima, of those given, that are less than three standard deviations worse.
+
+    As `undecided_signs` does, with errors on sky at all wavelengths. What lies within three of the
+    ``stds`` of another is the same; what fits exactly as well is a mirror solution anyway.
+    """
+    problem, free = Problem(measurement, measurement.weighting), measurement.free
+    # what a prior holds departs from it at all wavelengths alike: that counts once
+    known = [slot.size for slot, prior in free.priors if not prior.is_flat]
+    once = [np.full(size, size**-0.5) for size in known]
+    counts = np.concatenate([np.ones(measurement.n_data), *once])
+    whole, inverse = max(measurement.n_data - free.size, 1), np.zeros(free.size)
+    # what is held, or open, is no way to another
+    np.divide(1, stds, out=inverse, where=stds > 0)
+    seen, found, errors = [problem.solution], [], np.zeros((2, measurement.wavelength.size))
+    total = np.sum((counts * problem.residuals(seen[0])) ** 2)
+    for there in minima if total > 0 else ():
+        ratio = np.sum((counts * problem.residuals(there)) ** 2) / total
+        lost = whole * np.log(ratio)
+        ways = np.array([np.abs(there - one) * inverse for one in seen])
+        if not (ROUNDED < abs(ratio - 1) and lost < _UNDECIDED and ways.max(axis=1).min() > 3):
+            continue
+        seen.append(there)
+        far = int(np.argmax(ways[0]))
+        shown = f"{there[far] / free.factors()[far]:.4g} {free.units[far] or ''}".strip()
+        words = (
+            f"{free.names[far]}: in another minimum, at {shown}, the sum of squares is "
+            f"{ratio:.2f} times as large: the data do not tell which is true"
+        )
+        found.append({"words": words, "sky": None})
+        if view is not None:
+            other = mean_errors(view, seen_with(view, measurement.put_back(there)))
+            errors = np.maximum(errors, other / (1 + np.exp(lost / 2)))
     return found, errors
 
 

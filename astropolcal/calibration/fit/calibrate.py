@@ -284,7 +284,7 @@ def fitted(
     else:
         outcomes, weighting, stages = (two_step if strategy == "two-step" else sequential)(*how)
         # the first step that did not converge makes the next ones useless
-        outcome = next((o for o in outcomes if not o["converged"]), outcomes[-1])
+        outcome = next((o for o in outcomes if not o["converged"]), outcomes[-1]) | {"others": []}
     if loss != "linear":
         # iteratively reweighted least squares
         first, what = robust_weighting(measurement, loss), "the weights of the robust fit"
@@ -522,7 +522,8 @@ def _result(fitted, covariance=None):
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
     stds = own.stds * measurement.free.factors()
-    signs, errors_of_signs = undecided_signs(measurement, view, stds, fitted.lawful)
+    others = fit.pop("others", ())
+    signs, errors_of_signs = undecided_signs(measurement, view, stds, others, fitted.lawful)
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting

@@ -166,7 +166,8 @@ def outside_bounds(measurement):
 def joint(measurement, weighting, fitter, search, options=None):
     """Fit everything; again from other axes, signs and, where residuals stand out, laws.
 
-    With ``options`` of the measurement what only stars see is fitted by itself first.
+    With ``options`` of the measurement what only stars see is fitted by itself first. How it went
+    has the other minima that were seen, ``others``.
     """
     origin = measurement.vector()
     how = fitter, search, options, origin
@@ -180,10 +181,11 @@ def joint(measurement, weighting, fitter, search, options=None):
         laws = other_laws(problem, found, origin)[:_STARTS]
         starts += [(start, _BETTER) for told, start in laws if told <= _HOPELESS * least]
     best = _from_others(measurement, weighting, best, problem, starts, how)
-    best = _behind_mirrors(measurement, best, how)
+    best, others = _behind_mirrors(measurement, best, how)
     problem = BinProblem(*few_frames(measurement, best[1]))
     signs = [(start, CLEARLY_BETTER) for start in other_signs(problem, measurement.vector())]
-    return _from_others(measurement, best[1], best, problem, signs, how)
+    outcome, weighting = _from_others(measurement, best[1], best, problem, signs, how)
+    return outcome | {"others": others}, weighting
 
 
 def _from_others(measurement, weighting, best, problem, starts, how):
@@ -215,11 +217,14 @@ def _from_others(measurement, weighting, best, problem, starts, how):
 
 
 def _behind_mirrors(measurement, best, how):
-    """Fit again from where axes and phases lie on the other sides of what priors hold them near."""
-    problem = BinProblem(*few_frames(measurement, best[1]))
+    """Fit again from where axes and phases lie on the other sides of what priors hold them near.
+
+    Returns with it where all such fits ended.
+    """
+    problem, others = BinProblem(*few_frames(measurement, best[1])), []
     axes, phases = centres(problem)
     if not axes or not phases or len(axes) + len(phases) > _MANY_SIGNS:
-        return best
+        return best, others
     found = measurement.vector()
     starts, least = mirrored(found, axes), np.sum(problem.residuals(found) ** 2)
     first, worth, is_last = least, 2 * problem.noise**2, False
@@ -227,9 +232,9 @@ def _behind_mirrors(measurement, best, how):
         start = starts.pop(0)
         # where a fit leads, wavelengths may have other signs again
         for _ in range(2):
-            start = best_signs(problem, start, phases)
-            start = problem.fit(start, evaluations=2 * GLANCE, gain=GAIN)[0]
-            left = np.sum(problem.residuals(start) ** 2)
+            # along the valleys of such data a fit creeps: given up early, it ends above the minimum
+            start, left, _ = problem.fit(best_signs(problem, start, phases))
+            others.append(start)
             if not _SAME_MINIMUM < left / least < FAR_WORSE:
                 break
         if left < least - worth:
@@ -239,7 +244,7 @@ def _behind_mirrors(measurement, best, how):
             starts, is_last = beside_centres(found, axes), True
     if least < first:
         best = _descend(measurement, best[1], *how, is_searched=True)
-    return best
+    return best, others
 
 
 def known_noises(measurement):

@@ -123,7 +123,7 @@ def verdict(calibration, targets=TARGETS):
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
         if "restarted" in calibration.settings:
             cautions.append("errors of parameters lack those of what is held")
-        cautions += _of_one_table(calibration)
+        cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
         cautions += _few(calibration)
         # a fit minds the bounds of what leads only
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
@@ -294,6 +294,14 @@ def _of_one_table(calibration):
     names = [name for name, copies in own.items() if on_sky & {c.split(".")[0] for c in copies}]
     if names:
         yield f"on sky as in {calibration.datasets[seen].name}: own values of {', '.join(names)}"
+
+
+def _elsewhere(calibration):
+    """Name what is far from here in other minima, which the data do not exclude."""
+    told = (one.split(": in another minimum") for one in calibration.identifiability.mirrors)
+    names = dict.fromkeys(one[0] for one in told if len(one) > 1)
+    if names:
+        yield f"another minimum fits nearly as well, with another {listed(names, 'or', 2)}"
 
 
 def _apart(calibration):
