@@ -601,14 +601,13 @@ class Reduced:
             sums = flat[:, :, flat.shape[2] // 2 :]
             self.lamps.append(sums @ probes.lamp_by_frame[i])
 
-    def first(self, k):
-        """Return the same for the law of the first columns of the basis."""
-        if k == self.target[0].shape[1]:
-            return self
+    def along(self, columns):
+        """Return the same for another law, whose basis is these combinations of its own, (k, j)."""
         part = copy(self)
-        part.gram = [g[:, :k, :k] for g in self.gram]
-        for name in ("target", "seen", "lamps"):
-            setattr(part, name, [each[:, :k] for each in getattr(self, name)])
+        part.gram = [columns.T @ g @ columns for g in self.gram]
+        part.target = [t @ columns for t in self.target]
+        for name in ("seen", "lamps"):
+            setattr(part, name, [columns.T @ each for each in getattr(self, name)])
         return part
 
     def together(self, numbers):

@@ -279,15 +279,14 @@ def _fitted(model, absent, without):
     probes = Probes(model, absent)
     wavelength, found, follow = probes.problem.wavelength, [], []
     basis, smooth = (law_basis(wavelength, degree) for degree in (_DEGREE, _SMOOTH))
-    settings = _settings(probes)
+    settings, inside = _settings(probes), np.linalg.lstsq(basis, smooth)[0]
     slopes = probes.slopes | _of_one_beam(probes)
     for (place, kind), slope in slopes.items():
         reduced = Reduced(probes, slope, basis)
         found.append(Course(place, kind, reduced, _first_law(reduced)))
         found[-1].fit(_ROUNDS)
-        reduced = Reduced(probes, slope, smooth)
         for stage, numbers in settings.items():
-            few = reduced.together(numbers)
+            few = reduced.together(numbers).along(inside)
             one = Course(place, kind, few, _first_law(few), stage=stage, settings=numbers)
             one.fit(_MORE)
             follow.append(one)
