@@ -252,9 +252,12 @@ def scan(model, effects=(), *, cells=True, temper=1.0, without=None, like=None):
 def _cells(probes, temper):
     """Return the candidate of every cell, with the better of its laws."""
     laws = {degree: law_basis(probes.problem.wavelength, degree) for degree in _DEGREES}
-    found = []
+    basis, found = laws[_DEGREES[-1]], []
+    # of a few wavelengths the smooth law is one value for each
+    inside = {degree: np.linalg.lstsq(basis, law)[0] for degree, law in laws.items()}
     for (place, kind), slopes in probes.slopes.items():
-        whole = Reduced(probes, slopes, laws[_DEGREES[-1]])
+        whole = Reduced(probes, slopes, basis)
+        parts = {degree: whole.along(columns) for degree, columns in inside.items()}
         names = probes.dependences_of(place, kind)
         if (place, kind) in probes.bends:
             names = [name for name in names if name != "constant"]
@@ -262,11 +265,11 @@ def _cells(probes, temper):
             bent = [one for d in _DEGREES for one in _of_cell(probes, constant, d, temper)]
             found += sorted(bent, key=preference)[:1]
         for same, waves in probes.grouped(names):
-            by_law = [(d, whole.first(law.shape[1]).normal(waves)) for d, law in laws.items()]
+            by_law = [(degree, part.normal(waves)) for degree, part in parts.items()]
             found += _candidates(place, kind, same, by_law, temper)
     # where none of these laws is half as good as one that is free
     least = max([ENOUGH, *(_SHARPER * one.evidence for one in found)])
-    has_freer = len(probes.problem.wavelength) > laws[_DEGREES[-1]].shape[1]
+    has_freer = len(basis) > basis.shape[1]
     for cell in _sharpest(probes, temper, least) if has_freer else ():
         free = [o for o in _of_cell(probes, cell, None, temper) if o.evidence > least]
         found = [o for o in found if not free or o.name != cell.name] + free

@@ -164,15 +164,16 @@ def _kind_words(cell):
     return f"{word} along the axes" if axis == "h" else f"{word} at 45 deg to the axes"
 
 
-def _own_name(optic):
+def own_name(optic):
+    """Return the name of an optic or stage in words."""
     return "half-wave plate" if optic == "hwp" else optic
 
 
 def _place_words(place):
     head, _, optic = place.partition(":")
     return {
-        "in": f"of the {_own_name(optic)}",
-        "after": f"downstream of the {_own_name(optic)}",
+        "in": f"of the {own_name(optic)}",
+        "after": f"downstream of the {own_name(optic)}",
         "source": "of the source, or upstream of the first optic that turns",
         "telescope": "upstream of the half-wave plate",
         "detector": "at the detector",
@@ -185,7 +186,7 @@ def _when(dependence):
     if kind in ("step", "frame"):
         # a table may number its frames in any way
         where = _ordinal(int(where) + 1)
-    where = _own_name(where).replace("=", " is ")
+    where = own_name(where).replace("=", " is ")
     words = _PATTERNS.get(kind, "").format(where, _TIMES.get(count, f"{count} times"))
     return words + (f' in "{run}" only' if run is not None else "")
 
@@ -603,15 +604,26 @@ class Reduced:
             sums = flat[:, :, flat.shape[2] // 2 :]
             self.lamps.append(sums @ probes.lamp_by_frame[i])
 
-    def first(self, k):
-        """Return the same for the law of the first columns of the basis."""
-        if k == self.target[0].shape[1]:
-            return self
+    def along(self, columns):
+        """Return the same for another law, whose basis is these combinations of its own, (k, j)."""
         part = copy(self)
-        part.gram = [g[:, :k, :k] for g in self.gram]
-        for name in ("target", "seen", "lamps"):
-            setattr(part, name, [each[:, :k] for each in getattr(self, name)])
+        part.gram = [columns.T @ g @ columns for g in self.gram]
+        part.target = [t @ columns for t in self.target]
+        for name in ("seen", "lamps"):
+            setattr(part, name, [columns.T @ each for each in getattr(self, name)])
         return part
+
+    def together(self, numbers):
+        """Return the same with all frames of a number, (F,) per dataset, as one frame."""
+        one, count = copy(self), 1 + max(number.max() for number in numbers)
+        members = [np.eye(count)[number].T for number in numbers]
+        for name in ("gram", "target", "seen", "lamps"):
+            tables = getattr(self, name)
+            pairs = zip(members, tables, strict=True)
+            tables = [_over_frames(m, t).reshape(count, *t.shape[1:]) for m, t in pairs]
+            # the lamp of each dataset has directions of its own
+            setattr(one, name, [np.concatenate(tables, -1) if name == "lamps" else sum(tables)])
+        return one
 
     def normal(self, waves):
         """

@@ -6,7 +6,8 @@ The table of dependences is a list, and nature does not read it. So at each plac
 the perturbation gets another size in every frame: :math:`c_f l(\lambda)`, a course c and a smooth
 law l in wavelength, beside all that model and lamp absorb. Each of the two is fitted while the
 other is held, in turn (alternating least squares). Where one such course explains the data as well
-as several causes do together, these may be one thing that no table has.
+as several causes do together, these may be one thing that no table has. A course that has one size
+for each angle of a stage has much less freedom, and is told from a cause that follows it by less.
 """
 
 from dataclasses import dataclass, field
@@ -16,14 +17,15 @@ from scipy.linalg import block_diag, eigh
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap.attribution import ENOUGH
-from astropolcal.gap.cells import Cell, Probes, Reduced
+from astropolcal.gap.cells import Cell, Probes, Reduced, own_name
 from astropolcal.gap.problem import law_basis
+from astropolcal.observations.grid import clusters
 from astropolcal.observations.pointings import frame_names
 
 __all__ = []
 
-# degree of the law in wavelength
-_DEGREE = 4
+# degree of the law in wavelength, and of what follows a stage
+_DEGREE, _SMOOTH = 4, 2
 # rounds for every place and kind, and for so many of the best
 _ROUNDS, _MORE, _BEST = 1, 5, 6
 # what lowers chi-square by less than this share more is the same
@@ -67,6 +69,10 @@ class Course:
     shape: str = ""
     #: Probability that noise alone lowers chi-square so much, for this place and kind alone.
     p_value: float = 1.0
+    #: The stage of which it is a function, and the number of its angle in every frame of each
+    #: dataset, (F,); empty where each frame has a size of its own.
+    stage: str = ""
+    settings: tuple = ()
 
     @property
     def words(self):
@@ -81,7 +87,9 @@ class Course:
         few = bool(len(there) == np.ptp(there) + 1 <= len(size) / 2)
         sharp = few and bool(np.sum(size[there] ** 2) > _NEARLY * np.sum(size**2))
         ends = dict.fromkeys(nm[[there[0], there[-1]]])
-        found = [self._when(model.observations), f"at {'-'.join(map(str, ends))} nm" * sharp]
+        follows = f"one size at each angle of the {own_name(self.stage)}" * bool(self.stage)
+        when = follows or self._when(model.observations)
+        found = [when, f"at {'-'.join(map(str, ends))} nm" * sharp]
         self.shape = ", ".join(filter(None, found))
 
     def _when(self, observations):
@@ -165,6 +173,17 @@ class Course:
         k = len(self.reduced.target[0][0])
         return 2 * np.sqrt((k - 1) * max(self.freedom - k + 1, 0))
 
+    def close(self, temper):
+        """Give each frame its size, with errors for residuals of a variance, once it is fitted."""
+        # large, and of no use any more
+        self.reduced = None
+        self.std = [np.sqrt(temper) * std for std in self.std]
+        if self.stage:
+            (wave,), (std,) = self.wave, self.std
+            # frames at one angle tell its size together
+            std = std * np.sqrt(np.bincount(np.concatenate(self.settings)))
+            self.wave, self.std = ([x[own] for own in self.settings] for x in (wave, std))
+
     def fit(self, rounds):
         """Fit law and course in turn, until nothing is gained."""
         if not self.wave:
@@ -229,10 +248,9 @@ def courses(model, base):
     large = max(1.0, model.mean_square)
     temper = max(1.0, min([large, *(_left(without, one) for one, without in found)]))
     temper *= 1 + (model.alike - 1) * temper / large
-    best = {}
+    # one that does no better than a constant is none
+    found = [(one, without) for one, without in found if not one.is_constant(temper)]
     for one, without in found:
-        if one.is_constant(temper):
-            continue
         # to first order, as the courses are
         lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
         freer = max(one.freedom - freedom, 1.0)
@@ -243,13 +261,12 @@ def courses(model, base):
         one.gained = float((one.lowered - lost) / temper - freer - luck)
         one.behind = float(-one.gained / scatter)
         one.p_value = float(chi2_above(one.lowered / temper - one.chosen, max(one.freedom, 1)))
-        one.std = [np.sqrt(temper) * std for std in one.std]
-        known = best.setdefault((one.place, one.kind), one)
-        best[one.place, one.kind] = max(known, one, key=lambda course: course.gained)
-    for one in best.values():
-        # large, and of no use once it is fitted
-        one.reduced = None
-    return sorted(best.values(), key=lambda one: -one.gained)
+        one.close(temper)
+    best = {}
+    # to be told that it follows a stage takes evidence, as a cause does
+    for one, _ in sorted(found, key=lambda each: ENOUGH * bool(each[0].stage) - each[0].gained):
+        best.setdefault((one.place, one.kind, one.stage), one)
+    return list(best.values())
 
 
 def _left(without, course):
@@ -260,17 +277,19 @@ def _left(without, course):
 def _fitted(model, absent, without):
     """Return the courses at a fitted model of which some effects are taken out."""
     probes = Probes(model, absent)
-    wavelength, found = probes.problem.wavelength, []
-    basis = law_basis(wavelength, _DEGREE)
+    wavelength, found, follow = probes.problem.wavelength, [], []
+    basis, smooth = (law_basis(wavelength, degree) for degree in (_DEGREE, _SMOOTH))
+    settings, inside = _settings(probes), np.linalg.lstsq(basis, smooth)[0]
     slopes = probes.slopes | _of_one_beam(probes)
     for (place, kind), slope in slopes.items():
         reduced = Reduced(probes, slope, basis)
-        # first the law along which most frames are off, against their noise
-        target, gram = np.concatenate(reduced.target), np.concatenate(reduced.gram).sum(axis=0)
-        noise = gram + _ABSORBED * (np.trace(gram) or 1.0) * np.eye(len(gram))
-        law = eigh(target.T @ target, noise)[1][:, -1]
-        found.append(Course(place, kind, reduced, law / np.linalg.norm(law)))
+        found.append(Course(place, kind, reduced, _first_law(reduced)))
         found[-1].fit(_ROUNDS)
+        for stage, numbers in settings.items():
+            few = reduced.together(numbers).along(inside)
+            one = Course(place, kind, few, _first_law(few), stage=stage, settings=numbers)
+            one.fit(_MORE)
+            follow.append(one)
     found = [one for one in found if one.lowered > 0]
     found.sort(key=lambda one: one.freedom - one.lowered)
     for i, one in enumerate(found[:_BEST]):
@@ -284,12 +303,37 @@ def _fitted(model, absent, without):
             gained = [o.lowered / left - o.freedom - o.chosen for o in (one, free)]
             if gained[1] > gained[0] + ENOUGH:
                 found[i] = free
+    found += [one for one in follow if one.lowered > 0]
     for one in found:
-        law = one.law if len(one.law) == len(wavelength) else basis @ one.law
+        law = one.law
+        law = law if len(law) == len(wavelength) else (smooth if one.stage else basis) @ law
         largest = law[np.argmax(np.abs(law))]
         one.law = law / largest
         one.wave = [wave * largest for wave in one.wave]
         one.std = [std * abs(largest) for std in one.std]
+    return found
+
+
+def _first_law(reduced):
+    """Return the law along which most frames are off, against their noise, of unit length."""
+    target, gram = np.concatenate(reduced.target), np.concatenate(reduced.gram).sum(axis=0)
+    noise = gram + _ABSORBED * (np.trace(gram) or 1.0) * np.eye(len(gram))
+    law = eigh(target.T @ target, noise)[1][:, -1]
+    return law / np.linalg.norm(law)
+
+
+def _settings(probes):
+    """Return, by stage, the number of its angle in every frame of each dataset, where few."""
+    found = {}
+    for name, waves in probes.waves.items():
+        kind, _, rest = name.partition(":")
+        stage, _, number = rest.partition(":")
+        if (kind, number) == ("harmonic", "1"):
+            cosine, sine = np.concatenate(waves, axis=1)
+            count = 1 + (number := clusters(np.arctan2(sine, cosine), turn=2 * np.pi)).max()
+            # three are a constant and a harmonic; both are zero in a dataset without the stage
+            if 3 < count < len(number) / 2 and np.hypot(cosine, sine).all():
+                found[stage] = np.split(number, np.cumsum([w.shape[1] for w in waves])[:-1])
     return found
 
 

@@ -248,12 +248,16 @@ def _real_courses(model, base):
 
 
 def _alike_courses(base, found):
-    """Return the best courses, which the data do not tell apart, those of a simple shape first."""
+    """Return the best courses, which the data do not tell apart; first simple ones of no stage."""
     near = [2 * np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
-    best = [o for o, noise in zip(found, near, strict=True) if o.gained > found[0].gained - noise]
-    for one in best:
+    best = {}
+    for one, noise in zip(found, near, strict=True):
+        if one.gained > found[0].gained - noise:
+            # the best of those of one place and kind
+            best.setdefault((one.place, one.kind), one)
+    for one in best.values():
         one.find_shape(base)
-    return sorted(best, key=lambda one: not one.shape)
+    return sorted(best.values(), key=lambda one: not one.shape or bool(one.stage))
 
 
 def _errors(model, groups):

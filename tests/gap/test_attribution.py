@@ -202,3 +202,16 @@ def test_of_noise_statistics_are_chi_square_with_their_rank(found):
             values.append(one.statistic)
             ranks.append(one.rank)
     assert 1e-3 < stats.chi2.sf(np.sum(values), np.sum(ranks)) < 0.999
+
+
+@pytest.mark.slow
+def test_a_law_of_one_number_has_the_data_of_all_wavelengths():
+    for bins in ([0, 6], [0, 3, 6], [0, 2, 4, 6]):
+        wavelength = data.WAVELENGTH[bins]
+        model = data.fitted(data.observed(wavelength=wavelength), [data.chain(wavelength)])
+        found = scan(model)
+        constant = [one for one in found.candidates if one.degree == 0]
+        assert len(constant) > 50
+        for one in constant:
+            alone = found.of_cell(one.cell, 0)
+            assert one.evidence == pytest.approx(alone.evidence, abs=1e-6), (bins, one.name)

@@ -1,6 +1,7 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """One perturbation of any course through the run, in place of several causes."""
 
+import astropy.units as u
 import gap_data as data
 import numpy as np
 import pytest
@@ -28,11 +29,15 @@ def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
     )
     probes = Probes(model)
     channel, rows = probes.problem.channels[0], probes.problem.segments[0]
-    basis = law_basis(probes.problem.wavelength, 4)
+    basis, smooth = (law_basis(probes.problem.wavelength, degree) for degree in (4, 2))
     for one in courses(model, model)[::9]:
         slope = probes.slopes[one.place, one.kind][0]
         sizes = one.law[probes.problem.datasets[0].bins][:, None]
         each = np.eye(slope.shape[2])
+        if one.stage:
+            # frames at one angle have one size
+            each = each[one.settings[0]].T
+            each = each[each.any(axis=1)]
         length = [np.linalg.norm(channel.whiten_frames(slope * sizes * one)) for one in each]
         # a column of its own for each frame that tells it, of unit length before what lamp and
         # model absorb is taken out
@@ -46,7 +51,7 @@ def test_a_course_is_the_least_squares_solution_of_one_size_in_every_frame():
         told = left[:, strength > 1e-3].T @ probes.residual
         rank = len(told)
         assert one.lowered == pytest.approx(told @ told, rel=1e-6), one.words
-        assert one.freedom == rank + basis.shape[1] - 1, one.words
+        assert one.freedom == rank + (smooth if one.stage else basis).shape[1] - 1, one.words
 
 
 def test_frames_wavelengths_and_beam_of_a_course_are_found():
@@ -80,6 +85,29 @@ def test_what_is_the_same_in_all_frames_is_no_course():
     for one in found[:20]:
         one.find_shape(model)
         assert "frame 0 on" not in one.shape
+
+
+@pytest.mark.slow
+def test_what_follows_a_stage_in_a_way_that_no_harmonic_does_has_no_name():
+    """Half of what a move leaves behind is gone at the next: nearly an error of the encoder."""
+    table = data.frames()
+    told = table["hwp"].copy()
+    moves, left = np.diff(told.to_value("rad"), prepend=told[0].to_value("rad")), [0.0]
+    for move in moves[1:]:
+        left.append(left[-1] / 2 + move)
+    for error, size, named in ((np.cos(told + 23 * u.deg), 0.15, True), (left, 0.1, False)):
+        table["hwp"] = told + size * np.asarray(error) * u.deg
+        seen = data.observed(table=table)
+        written = seen.to_table()
+        written["hwp"] = np.repeat(told, seen.n_bins)
+        diagnosis = diagnose(data.chain(), Observations.from_table(written, name="lamp"))
+        sure = diagnosis.causes[0].probability
+        assert (sure > 0.95, sure < 0.3, diagnosis.courses == []) == (named, not named, named)
+    best = next(one for one in diagnosis.courses if one.kind == "orientation")
+    assert (best.place, best.stage) == ("in:hwp", "hwp")
+    assert best.shape == "one size at each angle of the half-wave plate"
+    for wave in best.wave:
+        assert np.ptp([wave[told == angle] for angle in np.unique(told)], axis=1).max() == 0
 
 
 @pytest.mark.long
