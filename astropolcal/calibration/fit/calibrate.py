@@ -505,15 +505,15 @@ def _result(fitted, covariance=None):
     """Return the calibration; ``covariance`` is that of more data than its own."""
     measurement, whitened = fitted.measurement, fitted.whitened
     settings, fit = fitted.settings, dict(fitted.fit)
-    vector, names = measurement.vector(), measurement.free.names
-    residuals, weighting = measurement.residuals(vector), measurement.weighting
+    vector, weighting = measurement.vector(), measurement.weighting
+    names, residuals = measurement.free.names, measurement.residuals(vector)
     view = view_of_measurement(measurement, vector, settings["instrument"])
     finding = complete(measurement, whitened, weighting.level, view)
     if covariance is not None and not measurement.free.priors:
         # by the data of all runs, too
         finding.identifiable |= np.isfinite(covariance.stds)
-    is_white = settings["errors"] == "white"
-    scatter = None if is_white else Scatter.of(measurement, weighting, whitened)
+    white = settings["errors"] == "white"
+    scatter = None if white else Scatter.of(measurement, weighting, whitened)
     own = covariance_around(measurement, whitened, weighting, scatter)
     if covariance is None and np.isfinite(weighting.level):
         own, curved = _along_valleys(measurement, whitened, own, view)
@@ -522,12 +522,12 @@ def _result(fitted, covariance=None):
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
     stds = own.stds * measurement.free.factors()
-    others = fit.pop("others", ())
-    signs, errors_of_signs = undecided_signs(measurement, view, stds, others, fitted.lawful)
+    others = fit.pop("others", ()), fitted.lawful
+    signs, errors_of_signs = undecided_signs(measurement, view, stds, *others)
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
-    lacking = None if is_white else model_error(measurement, scatter, errors_of_signs)
+    lacking = None if white else model_error(measurement, scatter, errors_of_signs)
     calibration = Calibration(
         chains=measurement.put_back(vector),
         wavelength=(measurement.wavelength * u.um).to(u.nm),
@@ -548,8 +548,7 @@ def _result(fitted, covariance=None):
         provenance=provenance()
         | {"scipy": installed("scipy"), "python": platform.python_version()},
     )
-    observations = (dataset.observations for dataset in measurement.datasets)
-    fit["masked"] = [dict(each.mask_reasons) for each in observations]
+    fit["masked"] = [dict(each.observations.mask_reasons) for each in measurement.datasets]
     fit["bounds"] = errors_at_bounds(measurement, whitened, scatter)
     fit["lack_of_fit"] = _lack_of_fit(calibration, whitened)
     # the pairs of frames at odds with the fit, for summary, JSON and file
