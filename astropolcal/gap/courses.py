@@ -7,7 +7,8 @@ the perturbation gets another size in every frame: :math:`c_f l(\lambda)`, a cou
 law l in wavelength, beside all that model and lamp absorb. Each of the two is fitted while the
 other is held, in turn (alternating least squares). Where one such course explains the data as well
 as several causes do together, these may be one thing that no table has. A course that has one size
-for each angle of a stage has much less freedom, and is distinguished from a cause that follows it by less.
+for each angle of a stage has much less freedom, and less evidence distinguishes it from a cause
+that follows the stage.
 """
 
 from dataclasses import dataclass, field
