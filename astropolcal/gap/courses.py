@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag, eigh
+from scipy.stats import chi2
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap.attribution import ENOUGH
@@ -35,8 +36,9 @@ _SAME = 1e-4
 # law is where it has more than a part of its largest value
 _NEARLY, _AS_MUCH, _PART = 0.9, 0.05, 0.5
 _TWO_SIGMA = 4.0
-# so many standard deviations more than expected noise may gain
-_LUCK = 2.0
+# so many standard deviations more than expected noise may gain, and with this probability the best
+# of all courses that follow a stage
+_LUCK, _BEST_BY_CHANCE = 2.0, 0.05
 # by this share of what causes explain the model without them may be off, to first order
 _LINEAR = 0.1
 # a direction of which model and lamp leave less than this is theirs
@@ -251,6 +253,7 @@ def courses(model, base):
     temper *= 1 + (model.alike - 1) * temper / large
     # one that does no better than a constant is none
     found = [(one, without) for one, without in found if not one.is_constant(temper)]
+    looks = sum(bool(one.stage) for one, _ in found)
     for one, without in found:
         # to first order, as the courses are
         lost, freedom = without.chi2 - model.fit.chi2, without.freedom - model.linear.freedom
@@ -259,13 +262,14 @@ def courses(model, base):
         # of a single wavelength takes it all
         scatter = np.sqrt(2 * freer)
         luck = max(one.chosen, _LUCK * scatter)
+        if one.stage:
+            luck = max(luck, chi2.isf(_BEST_BY_CHANCE / looks, freer) - freer)
         one.gained = float((one.lowered - lost) / temper - freer - luck)
         one.behind = float(-one.gained / scatter)
         one.p_value = float(chi2_above(one.lowered / temper - one.chosen, max(one.freedom, 1)))
         one.close(temper)
     best = {}
-    # to be told that it follows a stage takes evidence, as a cause does
-    for one, _ in sorted(found, key=lambda each: ENOUGH * bool(each[0].stage) - each[0].gained):
+    for one, _ in sorted(found, key=lambda each: -each[0].gained):
         best.setdefault((one.place, one.kind, one.stage), one)
     return list(best.values())
 

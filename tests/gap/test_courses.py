@@ -13,6 +13,7 @@ from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.problem import law_basis
 from astropolcal.gap.report import to_dict
 from astropolcal.observations import Observations
+from astropolcal.simulation import half_wave_plate_cycles
 
 
 def answered(seed, **how):
@@ -90,12 +91,12 @@ def test_what_is_the_same_in_all_frames_is_no_course():
 @pytest.mark.slow
 def test_what_follows_a_stage_in_a_way_that_no_harmonic_does_has_no_name():
     """Half of what a move leaves behind is gone at the next: nearly an error of the encoder."""
-    table = data.frames()
+    table = half_wave_plate_cycles(derotator=np.linspace(45, 120, 12) * u.deg)
     told = table["hwp"].copy()
     moves, left = np.diff(told.to_value("rad"), prepend=told[0].to_value("rad")), [0.0]
     for move in moves[1:]:
         left.append(left[-1] / 2 + move)
-    for error, size, named in ((np.cos(told + 23 * u.deg), 0.15, True), (left, 0.1, False)):
+    for error, size, named in ((np.cos(told + 23 * u.deg), 0.15, True), (left, 0.08, False)):
         table["hwp"] = told + size * np.asarray(error) * u.deg
         seen = data.observed(table=table)
         written = seen.to_table()
