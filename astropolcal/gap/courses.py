@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag, eigh
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
 from astropolcal.gap.attribution import ENOUGH
@@ -263,7 +263,7 @@ def courses(model, base):
         scatter = np.sqrt(2 * freer)
         luck = max(one.chosen, _LUCK * scatter)
         if one.stage:
-            luck = max(luck, chi2.isf(_BEST_BY_CHANCE / looks, freer) - freer)
+            luck = max(luck, chdtri(freer, _BEST_BY_CHANCE / looks) - freer)
         one.gained = float((one.lowered - lost) / temper - freer - luck)
         one.behind = float(-one.gained / scatter)
         one.p_value = float(chi2_above(one.lowered / temper - one.chosen, max(one.freedom, 1)))
