@@ -10,6 +10,7 @@ import io
 import warnings
 from contextlib import contextmanager, suppress
 from copy import deepcopy
+from dataclasses import replace
 from functools import cached_property
 from textwrap import wrap
 
@@ -500,7 +501,9 @@ def with_causes(model, instrument=None):
     sky, either.
     """
     if not model.added:
-        return (model.calibration or _with_causes_held(model, instrument)).calibration()
+        made = model.calibration or _with_causes_held(model, instrument)
+        told = {"instrument": instrument or made.settings["instrument"]}
+        return replace(made, settings=made.settings | told).calibration()
     found, chains = Fitted(model), [chain.copy() for chain in model.chains]
     causes = {p.name: p for own in model.added.values() for p in own}
     for name, parameter in causes.items():

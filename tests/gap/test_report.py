@@ -438,8 +438,10 @@ def test_what_takes_a_parameter_off_its_prior_may_be_what_the_model_lacks():
         assert (says in " ".join(told["sentences"])) == bool(sigma)
 
 
-def test_an_improved_model_is_a_calibration_with_the_sizes_and_errors_of_the_report(found):
-    seen, report = with_causes(found.improved), Fitted(found.improved)
+def test_an_improved_model_is_a_calibration_with_the_sizes_and_errors_of_the_report(found, nothing):
+    seen, report = with_causes(found.improved, "charis"), Fitted(found.improved)
+    # of the instrument that is asked for, with and without causes
+    assert [seen.instrument, with_causes(nothing.improved, "charis").instrument] == ["charis"] * 2
     (cause,) = found.causes
     for name, size in report.sizes(cause.name).items():
         optic, key = name.split(".")
