@@ -374,11 +374,9 @@ class Model:
         problem, fit, own = copied(self.problem), self.fit, {}
         for name, added in self.added.items():
             rows = [problem.numbers([one.name]) for one in added]
-            usual = [
-                np.full(len(row), p.canonical_scale) for row, p in zip(rows, added, strict=True)
-            ]
-            if any(map(len, rows)):
-                own[name] = np.concatenate(rows), np.concatenate(usual)
+            usual = np.repeat([one.canonical_scale for one in added], [len(row) for row in rows])
+            if usual.size:
+                own[name] = np.concatenate(rows), usual
         before = dict.fromkeys(own, np.inf)
         for _ in range(_SHRINKS):
             away = np.abs(fit.coefficients - problem.absent)

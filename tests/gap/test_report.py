@@ -448,3 +448,18 @@ def test_an_improved_model_is_a_calibration_with_the_sizes_and_errors_of_the_rep
         std = [seen.covariance.std(f"{name}[{i}]") for i in range(len(size["std"]))]
         assert np.allclose(getattr(seen.chains[0][optic], key), size["value"])
         assert np.allclose(std, size["std"], rtol=0.01)
+
+
+@pytest.mark.slow
+def test_what_no_datum_says_of_a_cause_is_no_larger_than_usual():
+    """A static retarder along the axes that the derotator has at few angles may be anything."""
+    truth = with_effect("static_retarder", horizontal=0.02, diagonal=-0.05)
+    asked = {"effects": ["static_retarder"], "cells": False, "cross_validate": False}
+    found = diagnose(chain(), observed(truth, seed=2, flux=1e7), **asked)
+    sizes = Fitted(found.improved).sizes("static_retarder")
+    diagonal, horizontal = (
+        sizes[f"gap_static_retarder.{key}"] for key in ("diagonal", "horizontal")
+    )
+    assert np.allclose(diagonal["value"], -0.05, atol=0.01)
+    assert np.abs(horizontal["value"]).max() < 1
+    assert 1 < np.max(horizontal["std"]) < 10
