@@ -17,7 +17,7 @@ RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
 # products of columns tell directions whose eigenvalues are above this share of the largest
-_CLEAR = 1e-8
+_CLEAR = 1e-5
 # rows of a block of a triangular factorization
 _BLOCK = 4096
 # a parameter that moves by less than this share along an open direction is static
@@ -70,24 +70,27 @@ def orthonormal(columns, keep=RANK):
     """
     Return an orthonormal basis, (n_rows, rank), of columns, (n_rows, k), compared at unit length.
     """
-    norm = np.linalg.norm(columns, axis=0)
-    columns = columns[:, norm > 0] / norm[norm > 0]
-    if not columns.shape[1]:
-        return np.zeros((len(columns), 0))
-    # from the small matrix of products, and once more for what that has rounded
-    values, vectors = np.linalg.eigh(columns.T @ columns)
-    clear = values > _CLEAR * values.max()
-    basis = columns @ (vectors[:, clear] / np.sqrt(values[clear]))
-    basis = basis @ inverse_root(basis.T @ basis, 0.5)
-    if clear.all():
-        return basis
     # a calibration is read where there is no scipy
     from scipy.linalg import qr
+    from scipy.linalg.lapack import dpstrf, dtrtri
 
-    # what is nearly a sum of other columns the products do not tell
-    rest = columns @ vectors[:, ~clear]
+    gram = np.asarray_chkfinite(columns.T @ columns)
+    norm = np.sqrt(np.diag(gram))
+    if not norm.any():
+        return columns[:, :0]
+    norm = np.where(norm > 0, norm, 1.0)
+    # from the products of what is clearly no sum of other columns
+    triangle, order, rank, _ = dpstrf(gram / np.outer(norm, norm), tol=_CLEAR)
+    clear, others = np.split(order - 1, [rank])
+    steps = np.zeros((norm.size, rank))
+    steps[clear] = np.triu(dtrtri(triangle[:rank, :rank])[0]) / norm[clear, None]
+    basis = columns @ steps
+    if not others.size:
+        return basis
+    # what is nearly a sum the products do not tell
+    rest = columns[:, others] / norm[others]
     rest -= basis @ (basis.T @ rest)
-    rest, triangle, _ = qr(rest, mode="economic", pivoting=True, check_finite=False)
+    rest, triangle, _ = qr(rest, mode="economic", pivoting=True)
     rest = rest[:, np.abs(np.diag(triangle)) > keep]
     rest = np.linalg.qr(rest - basis @ (basis.T @ rest))[0]
     return np.concatenate([basis, rest], axis=1)
