@@ -136,6 +136,21 @@ def element_names(name, size):
     return [name] if size == 1 else [f"{name}[{i}]" for i in range(size)]
 
 
+def stem(name):
+    """Return the parameter, ``"optic.parameter"``, of an element."""
+    return name.partition("[")[0]
+
+
+def optic(name):
+    """Return the optic of a parameter, or of an element."""
+    return name.partition(".")[0]
+
+
+def is_of(name, wanted):
+    """Return whether an element is of one of some parameters or optics."""
+    return stem(name) in wanted or optic(name) in wanted
+
+
 def limits(bounds):
     """Return the bounds of a parameter as two numbers, infinite where open."""
     low, high = bounds

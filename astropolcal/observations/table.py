@@ -164,8 +164,14 @@ class Observations:
         """  # noqa: E501
         label = str(name if path is None else path)
         table = reading.complete_table(table, label)
-        grid = _seen(build_grid(table, label), label)
-        return cls(grid, getattr(table, "meta", {}), name, path)
+        found = cls(build_grid(table, label), getattr(table, "meta", {}), name, path)
+        dark = found.mask.all(axis=0)
+        if not dark.any():
+            return found
+        # a fit can constrain nothing there
+        words = listed([f"{w:.4g}" for w in found.wavelength[dark].to_value(u.nm)])
+        warn(f"{label}: no usable cell at {words} nm; left out", stacklevel=3)
+        return found.select_bins(~dark)
 
     @property
     def instrument(self):
@@ -552,7 +558,31 @@ class Observations:
         >>> obs.with_mask(obs.flux_right < 400, "faint").mask_reasons
         {'faint': 3}
         """
-        return self._with(masked_grid(self._grid, mask, reason, self._label))
+        grid, label = self._grid, self._label
+        mask, known = np.asarray(mask), self.mask
+        shapes = (known.shape, known.shape[:1])
+        if mask.dtype != bool or mask.shape not in shapes:
+            raise ObservationError(
+                f"{label}: mask of type {mask.dtype} and shape {mask.shape}; allowed are "
+                f"booleans of shape {shapes[0]} or {shapes[1]}"
+            )
+        if not isinstance(reason, str) or not reason.strip():
+            raise ObservationError(f"{label}: reason = {reason!r}, some words are needed")
+        reason = reason.strip()
+        new = (mask if mask.ndim == 2 else mask[:, None]) & ~known
+        if (new | known).all():
+            raise ObservationError(
+                f"{label}: masking {reason!r} would leave no usable cell of {new.size}"
+            )
+        reasons = grid.reasons if reason in grid.reasons else (*grid.reasons, reason)
+        # a masked flux is NaN as well, so that what forgets the mask cannot use it
+        return self._with(
+            flux_right=np.where(new, np.nan, grid.flux_right),
+            flux_left=np.where(new, np.nan, grid.flux_left),
+            errors={name: np.where(new, np.nan, error) for name, error in grid.errors.items()},
+            reason=np.where(new, reasons.index(reason) + 1, grid.reason),
+            reasons=reasons,
+        )
 
     def select(self, frames):
         """
@@ -579,7 +609,29 @@ class Observations:
         >>> obs.select(obs.pairs()[0]).frames["hwp"].value.tolist()
         [0.0, 45.0]
         """
-        return self._with(some_frames(self._grid, frames, self._label))
+        frames, n_frames, label = np.asarray(frames), self.n_frames, self._label
+        if frames.dtype == bool and frames.shape == (n_frames,):
+            frames = np.flatnonzero(frames)
+        # an empty list has type float, and selects nothing that could be used
+        if frames.dtype.kind not in "iu" or frames.ndim != 1:
+            raise ObservationError(
+                f"{label}: frames of type {frames.dtype} and shape {frames.shape}; allowed "
+                f"are {n_frames} booleans or a list of indices"
+            )
+        outside = frames[(frames < -n_frames) | (frames >= n_frames)]
+        if outside.size:
+            raise ObservationError(
+                f"{label}: frame index {outside[0]}, allowed are 0 to {n_frames - 1}"
+            )
+        # -1 and the last index are the same frame
+        index, counts = np.unique(frames % n_frames, return_counts=True)
+        if (counts > 1).any():
+            raise ObservationError(
+                f"{label}: frame index {index[counts > 1][0]} is given twice, "
+                "each frame is allowed once"
+            )
+        own = {"frames": self._grid.frames[index], "rows": self._grid.rows[index]}
+        return self._part((index,), f"the {counted(len(index), 'frame')} selected have", **own)
 
     def select_bins(self, bins):
         """
@@ -607,10 +659,27 @@ class Observations:
         >>> obs.select_bins(obs.wavelength < 1.5 * u.um).n_bins
         1
         """
-        return self._with(some_bins(self._grid, bins, self._label))
+        chosen = np.asarray(bins)
+        if chosen.dtype != bool or chosen.shape != (self.n_bins,):
+            raise ObservationError(
+                f"{self._label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
+                f"are {self.n_bins} booleans"
+            )
+        own = {"bin": self.bin[chosen], "wavelength": self._grid.wavelength[chosen]}
+        return self._part((slice(None), chosen), "the bins selected have", **own)
 
-    def _with(self, grid):
-        """Return observations of another grid, with the same meta, name and file."""
+    def _part(self, place, words, **own):
+        """Return some of the cells, which have columns of their own."""
+        if self.mask[place].all():
+            raise ObservationError(f"{self._label}: {words} no usable cell")
+        for name in ("flux_right", "flux_left", "reason"):
+            own[name] = getattr(self._grid, name)[place]
+        errors = {name: error[place] for name, error in self._grid.errors.items()}
+        return self._with(errors=errors, **own)
+
+    def _with(self, **changes):
+        """Return observations of a changed grid, with the same meta, name and file."""
+        grid = dataclasses.replace(self._grid, **changes)
         return Observations(grid, self.meta, self.name, self.path)
 
     def to_table(self):
@@ -685,100 +754,6 @@ def _span(angles):
 
 def _is_angle(column):
     return isinstance(column, u.Quantity) and column.unit.is_equivalent(u.rad)
-
-
-# ---- parts of a grid -----------------------------------------------------------------------------
-
-
-def masked_grid(grid, mask, reason, label):
-    """
-    Return a grid with more cells masked: a mask of shape (F, W), or (F,) for whole frames.
-
-    Cells masked before keep their reason.
-    """
-    mask, known = np.asarray(mask), grid.reason > 0
-    shapes = (known.shape, known.shape[:1])
-    if mask.dtype != bool or mask.shape not in shapes:
-        raise ObservationError(
-            f"{label}: mask of type {mask.dtype} and shape {mask.shape}; allowed are "
-            f"booleans of shape {shapes[0]} or {shapes[1]}"
-        )
-    if not isinstance(reason, str) or not reason.strip():
-        raise ObservationError(f"{label}: reason = {reason!r}, some words are needed")
-    reason = reason.strip()
-    new = (mask if mask.ndim == 2 else mask[:, None]) & ~known
-    if (new | known).all():
-        raise ObservationError(
-            f"{label}: masking {reason!r} would leave no usable cell of {new.size}"
-        )
-    reasons = grid.reasons if reason in grid.reasons else (*grid.reasons, reason)
-    # a masked flux is NaN as well, so that what forgets the mask cannot use it
-    return dataclasses.replace(
-        grid,
-        flux_right=np.where(new, np.nan, grid.flux_right),
-        flux_left=np.where(new, np.nan, grid.flux_left),
-        errors={name: np.where(new, np.nan, error) for name, error in grid.errors.items()},
-        reason=np.where(new, reasons.index(reason) + 1, grid.reason),
-        reasons=reasons,
-    )
-
-
-def _seen(grid, label):
-    """Return the grid at wavelengths with a usable cell, the ones that a fit can constrain."""
-    dark = (grid.reason > 0).all(axis=0)
-    if not dark.any():
-        return grid
-    words = listed([f"{w:.4g}" for w in grid.wavelength[dark].to_value(u.nm)])
-    warn(f"{label}: no usable cell at {words} nm; left out", stacklevel=4)
-    return some_bins(grid, ~dark, label)
-
-
-def some_frames(grid, frames, label):
-    """Return the grid of some frames, by booleans or indices, in the order of the table."""
-    frames, n_frames = np.asarray(frames), len(grid.frames)
-    if frames.dtype == bool and frames.shape == (n_frames,):
-        frames = np.flatnonzero(frames)
-    # an empty list has type float, and selects nothing that could be used
-    if frames.dtype.kind not in "iu" or frames.ndim != 1:
-        raise ObservationError(
-            f"{label}: frames of type {frames.dtype} and shape {frames.shape}; allowed "
-            f"are {n_frames} booleans or a list of indices"
-        )
-    outside = frames[(frames < -n_frames) | (frames >= n_frames)]
-    if outside.size:
-        raise ObservationError(
-            f"{label}: frame index {outside[0]}, allowed are 0 to {n_frames - 1}"
-        )
-    # -1 and the last index are the same frame
-    index, counts = np.unique(frames % n_frames, return_counts=True)
-    if (counts > 1).any():
-        raise ObservationError(
-            f"{label}: frame index {index[counts > 1][0]} is given twice, "
-            "each frame is allowed once"
-        )
-    words = f"the {counted(len(index), 'frame')} selected have"
-    return _part(grid, (index,), label, words, frames=grid.frames[index], rows=grid.rows[index])
-
-
-def some_bins(grid, bins, label):
-    """Return the grid at some wavelengths, one boolean per bin."""
-    chosen, n_bins = np.asarray(bins), len(grid.bin)
-    if chosen.dtype != bool or chosen.shape != (n_bins,):
-        raise ObservationError(
-            f"{label}: bins of type {chosen.dtype} and shape {chosen.shape}; allowed "
-            f"are {n_bins} booleans"
-        )
-    own = {"bin": grid.bin[chosen], "wavelength": grid.wavelength[chosen]}
-    return _part(grid, (slice(None), chosen), label, "the bins selected have", **own)
-
-
-def _part(grid, place, label, words, **own):
-    """Return some of the cells of a grid, which have columns of their own."""
-    if grid.reason[place].all():
-        raise ObservationError(f"{label}: {words} no usable cell")
-    arrays = {key: getattr(grid, key)[place] for key in ("flux_right", "flux_left", "reason")}
-    errors = {name: error[place] for name, error in grid.errors.items()}
-    return dataclasses.replace(grid, errors=errors, **arrays, **own)
 
 
 # ---- fingerprint ---------------------------------------------------------------------------------

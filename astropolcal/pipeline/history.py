@@ -44,7 +44,7 @@ from astropolcal.chain import join, leaves
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import FitError, ParameterError, warn
 from astropolcal.measurement import parameter_table
-from astropolcal.measurement.parameters import declared_step, ties_among
+from astropolcal.measurement.parameters import declared_step, is_of, stem, ties_among
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import SAME_WAVELENGTH
 from astropolcal.pipeline.headers import date_of
@@ -122,7 +122,7 @@ def parameter_history(calibrations, parameters=None):
         date = date_of(calibration)
         for key, entry in calibration.parameter_values().items():
             held = entry["tied"] is not None
-            if held if parameters is None else not _belongs(key, parameters):
+            if held if parameters is None else not is_of(key, parameters):
                 continue
             grid = calibration.wavelength.to_value("nm") if entry["value"].ndim else [np.nan]
             unit, fixed = str(entry["unit"] or ""), entry["fixed"] or held
@@ -130,7 +130,7 @@ def parameter_history(calibrations, parameters=None):
             rows += [(date, name, key, *number, unit, fixed) for number in numbers]
     found = {row[2] for row in rows}
     for key in parameters or ():
-        if not any(_belongs(name, [key]) for name in found):
+        if not any(is_of(name, [key]) for name in found):
             raise ParameterError(f"no calibration has a parameter {key!r}")
     if parameters is None:
         free = {row[2] for row in rows if not row[-1]}
@@ -150,7 +150,7 @@ def parameter_history(calibrations, parameters=None):
 
 def _in_turn(value, first, name):
     """Return an angle in degree in the turn that is nearest to a first one, anything else as is."""
-    period = _PERIODS.get(name.partition("[")[0].rpartition(".")[2])
+    period = _PERIODS.get(stem(name).rpartition(".")[2])
     return value if period is None else value - period * np.round((value - first) / period)
 
 
@@ -206,7 +206,7 @@ class Change:
         return float(-ndtri_exp(_log_p(self.chi2, self.dof) - np.log(2)))
 
     def __str__(self):
-        names = list(dict.fromkeys(name.partition("[")[0] for name in self.parameters))
+        names = list(dict.fromkeys(map(stem, self.parameters)))
         between = f"from {self.calibrations[0]} to {self.calibrations[-1]}"
         what = ", ".join(names) or "nothing"
         if not self.dof:
@@ -354,9 +354,9 @@ def _common(named, spaces, parameters):
     if parameters is not None:
         for key in parameters:
             for (name, _), space in zip(named, spaces, strict=True):
-                if not any(_belongs(n, [key]) for n in space.names):
+                if not any(is_of(n, [key]) for n in space.names):
                     raise ParameterError(f"{name}: no free parameter {key!r}")
-        names = [n for n in names if _belongs(n, parameters)]
+        names = [n for n in names if is_of(n, parameters)]
     first, *grids = (calibration.wavelength.to_value("nm") for _, calibration in named)
     same = all(g.shape == first.shape and np.allclose(g, first, SAME_WAVELENGTH) for g in grids)
     if not same and any("[" in n for n in names):
@@ -365,11 +365,6 @@ def _common(named, spaces, parameters):
             "common to all wavelengths"
         )
     return names
-
-
-def _belongs(element, parameters):
-    stem = element.partition("[")[0]
-    return stem in parameters or stem.partition(".")[0] in parameters
 
 
 def _values(calibration, names):
@@ -697,7 +692,7 @@ def restart(calibration, observations, free, *, chain=None, **options):
     start["ties"] = {n: tie for n, tie in ties.items() if not table[tie.source][0].fixed}
     new = calibrate(chains, datasets, **(start | options))
     # what is held has no error, though it was not known
-    known, fitted = old.parameter_values(), {n.partition("[")[0] for n in new.covariance.names}
+    known, fitted = old.parameter_values(), {*map(stem, new.covariance.names)}
     open_ = [n for n in known if n in table and n not in fitted and "open" in known[n]["status"]]
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
     new.settings["restarted"] |= {"open": open_} if open_ else {}
@@ -718,7 +713,7 @@ def _errors_of_held(old, held):
     for name, parameters in parameter_table(chains).items():
         for parameter in parameters if name not in held else ():
             parameter.fixed = True
-    kept = [i for i, name in enumerate(whole.names) if name.partition("[")[0] in held]
+    kept = [i for i, name in enumerate(whole.names) if stem(name) in held]
     # one that was restarted has held others
     before = {k: x for k, x in (old.fit.get("model_error") or {}).items() if k.startswith("held_")}
     grid = {"wavelength_nm": old.wavelength.to_value(u.nm).tolist()}

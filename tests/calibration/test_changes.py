@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from astropolcal.measurement.parameters import is_of
 from astropolcal.pipeline import Change
-from astropolcal.pipeline.history import _belongs, _determined, _log_p, about_the_mean
+from astropolcal.pipeline.history import _determined, _log_p, about_the_mean
 
 
 def _change(chi2, dof, **options):
@@ -167,4 +168,4 @@ def test_an_element_belongs_to_a_parameter_or_an_optic():
         ("m3.n", ["m3.k"], False),
         ("m30.n", ["m3"], False),
     ]:
-        assert _belongs(element, parameters) == inside, (element, inside)
+        assert is_of(element, parameters) == inside, (element, inside)

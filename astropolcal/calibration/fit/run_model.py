@@ -26,6 +26,7 @@ from astropolcal.calibration.fit.evidence import (
 )
 from astropolcal.calibration.identifiability.linearized import STILL, decompose, orthonormal
 from astropolcal.exceptions import ParameterError
+from astropolcal.measurement.parameters import is_of, optic, stem
 from astropolcal.progress import stage
 from astropolcal.words import check_choice
 
@@ -59,9 +60,9 @@ class Model:
         count = Counter(name for names in self.names for name in names)
         _check_known(own, count, "own")
         self.own = [
-            np.array([count[n] == 1 or _is_of(n, own) for n in names]) for names in self.names
+            np.array([count[n] == 1 or is_of(n, own) for n in names]) for names in self.names
         ]
-        self.shared = [n for n in count if count[n] > 1 and not _is_of(n, own)]
+        self.shared = [n for n in count if count[n] > 1 and not is_of(n, own)]
         place = {name: k for k, name in enumerate(self.shared)}
         self.columns = [
             np.array([place[n] for n in np.array(names)[~mine]], dtype=int)
@@ -240,7 +241,7 @@ class Model:
         _check_known(vary, [n for names in self.varying.values() for n in names], "vary")
         for what, course in vary.items():
             check_choice(f"vary: {what}", course, COURSES, ParameterError)
-            names = [n for n in self.varying[optic(what)] if _is_of(n, [what])]
+            names = [n for n in self.varying[optic(what)] if is_of(n, [what])]
             # of a drift, and of a step at an event, every element has its own
             law, waves, found = np.eye(len(names)), waves_of(self.dates), []
             if course in ("walk", "scatter"):
@@ -408,17 +409,3 @@ def _check_known(wanted, names, what):
     for name in wanted:
         if name not in known:
             raise ParameterError(f"{what}: no free optic or parameter {name!r} in the runs")
-
-
-def stem(name):
-    """Return the parameter, ``"optic.parameter"``, of an element."""
-    return name.partition("[")[0]
-
-
-def optic(name):
-    """Return the optic of a parameter, or of an element."""
-    return name.partition(".")[0]
-
-
-def _is_of(name, wanted):
-    return stem(name) in wanted or optic(name) in wanted

@@ -30,7 +30,6 @@ from astropy.time import Time
 
 from astropolcal.calibration.fit.calibrate import ERRORS, standing_at
 from astropolcal.calibration.fit.run_model import Model as _Coefficients
-from astropolcal.calibration.fit.run_model import optic, stem
 from astropolcal.calibration.fit.strategies import joint, stands_out
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import rms
@@ -42,7 +41,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, understood
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import refuse_repeated
-from astropolcal.measurement.parameters import told_prior
+from astropolcal.measurement.parameters import optic, stem, told_prior
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import dates_of
 from astropolcal.progress import in_one_thread, stage, steps
