@@ -258,17 +258,19 @@ class Look:
         return missed, (vectors * np.maximum(1 - values, 0.0)) @ vectors.T, weight
 
     def sums_of_frame(self, i, f):
-        """Return what the sums of a frame miss, (W,), what the lamp leaves of sums, and whitening.
+        """Return by how far the sums of a frame miss what others predict, (W,), as `of_frame`.
 
-        The latter two are (W, W).
+        And the inverse of the covariance of this, and whitening, (W, W) each.
         """
-        channel, residual = self.problem.channels[i], self._parts[i][0]
+        channel, missed = self.problem.channels[i], self._parts[i][0][1, :, f]
         n, rows = channel.shape[1], self.problem.segments[i]
         lamp = self.lamps[i][rows].reshape(*channel.shape, -1)[1, :, f]
         single = np.zeros((n, *channel.shape))
         single[:, 1, :, f] = np.diag(channel.valid[:, f].astype(float))
-        whiten = channel.whiten_frames(single)[:, 1, :, f].T
-        return residual[1, :, f], np.eye(n) - lamp @ lamp.T, whiten
+        whiten, left = channel.whiten_frames(single)[:, 1, :, f].T, np.eye(n) - lamp @ lamp.T
+        if not self.out[i][f]:
+            missed = np.linalg.pinv(left, rcond=_SEEN, hermitian=True) @ missed
+        return missed, left, whiten
 
 
 def tails_of(off):
@@ -362,7 +364,7 @@ class Frame:
         self._plain, self._root = plain, _root(self._sight)
         missed, left, whiten = look.sums_of_frame(i, f)
         root, narrow = _root(left), 1 / np.sqrt(scatter)
-        self._sums = narrow * np.linalg.pinv(root, rcond=_TINY) @ missed, narrow * root @ whiten
+        self._sums = narrow * root @ missed, narrow * root @ whiten
 
     # ---- predictions ------------------------------------------------------------------------
 
@@ -487,14 +489,17 @@ class Frame:
             size = size + np.clip(step, -1.0, 1.0)
         before, after = (np.sum(self._of_beam(law, x, side)[0] ** 2) for x in (0 * size, size))
         chi2 = self.as_told().chi2 - float(before - after)
-        errors = np.sqrt(np.diag(np.linalg.pinv(inner, hermitian=True)))
+        covariance = np.linalg.pinv(inner, hermitian=True)
+        errors = np.sqrt(np.diag(covariance))
         # the law is about its mean: other coefficients are of its size or below
         biggest = max(np.abs(size).max(), errors[0])
         cost = _occam(size[0], errors[0], _FACTORS)
         cost += sum(_share(error, 2 * biggest) for error in errors[1:])
-        mean = float(np.exp(np.mean((law @ size)[self.valid])))
+        middle = law[self.valid].mean(axis=0)
+        mean = float(np.exp(middle @ size))
+        error = float(mean * np.sqrt(middle @ covariance @ middle))
         what, beam = ("brightness", "") if self.single else ("one beam", _BEAMS[side])
-        return Trial(what, chi2, cost, mean, float(errors[0] * mean), beam=beam)
+        return Trial(what, chi2, cost, mean, error, beam=beam)
 
     def _of_beam(self, law, size, side):
         """Return what a law leaves of differences and sums, and its derivatives; unit noise."""

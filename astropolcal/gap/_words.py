@@ -154,11 +154,11 @@ def _size(value, std, unit, limit, degree=None):
     middle, low, high = (f"{f(values):.{digits}f}" for f in (np.median, np.min, np.max))
     least, most = (percent(f(errors), 2) for f in (np.min, np.max))
     text = f"{low} to {high}{ends}, median {middle}, errors {least} to {most}{ends}"
-    if low == high and least == most:
-        text = f"{middle} +- {errors[0]:.{digits}f}{ends}"
+    if low == high:
+        text = f"{middle} +- {np.max(errors):.{digits}f}{ends}"
         text += " at every wavelength" if several else ""
     elif degree is not None:
-        text += f", if it is a polynomial of degree {degree} in wavelength"
+        text += f", if it is nearly a polynomial of degree {degree} in wavelength"
     if known.all():
         return text
     return f"{text}; determined at {known.sum()} of {known.size} wavelengths"

@@ -11,7 +11,7 @@ that the true cause is expected to have.
 
 from copy import copy
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import dropwhile, product
 
 import astropy.units as u
 import numpy as np
@@ -580,7 +580,9 @@ def expected(weights, factors):
 
 def _set_up(chain, exposure):
     """Return copies of the optics of a chain as the exposure needs them."""
-    train = Train(leaf.copy() for leaf in leaves(chain) if leaf.name not in exposure.without)
+    kept = (leaf.copy() for leaf in leaves(chain) if leaf.name not in exposure.without)
+    # where nothing is left upstream of what turns, no diagnosis has a place for causes there
+    train = Train(dropwhile(lambda leaf: (leaf.name or "").startswith("gap_"), kept))
     if exposure.polarizer_turned:
         turned_by(exposure.polarizer_turned)(train, Roles(train).polarizer)
     return train

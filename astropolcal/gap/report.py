@@ -29,7 +29,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapErro
 from astropolcal.files import plain
 from astropolcal.gap import _words, runs
 from astropolcal.gap.planning import plan
-from astropolcal.gap.problem import OPEN, TOUCHES
+from astropolcal.gap.problem import OPEN, TOUCHES, GapProblem, law_basis
 from astropolcal.gap.residuals import locate
 from astropolcal.gap.selection import REMAINDER
 from astropolcal.measurement import Measurement, Normal, parameter_table
@@ -59,6 +59,8 @@ ACCURACIES = ("s_res", "s_mean", "s_cv")
 _STRONG, _MOST_TRADES = 0.5, 3
 # perturbations that are angles
 ANGLES = ("retardance", "rotation")
+# coefficients by which a law bends more than it was asked for, as shares of its size
+_BENDS = (0.001, 0.01, 0.03, 0.1)
 # directions below this share of the largest take nothing up
 _TINY = 1e-9
 
@@ -288,8 +290,7 @@ class Fitted:
             value, std, block = self.values(parameter)
             size = {"value": _number(value / factor), "std": _number(std / factor), "unit": unit}
             size |= {"limit": float(parameter.canonical_limit / factor)}
-            # the errors hold if the law has no more freedom than that
-            degree = block.shape[1] - 1 if block.shape[1] < len(block) else None
+            degree = block.shape[1] - 1 if self._is_smooth(block) else None
             found[parameter.name] = size | {"degree": degree}
         return found
 
@@ -299,9 +300,62 @@ class Fitted:
         block = parameter.basis if slot.per_wavelength else None
         block = np.eye(where.stop - where.start) if block is None else block
         value = self.problem.vector(self.model.fit.coefficients)[slot.slice]
-        std = np.sqrt(np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block))
+        square = np.einsum("ij,jk,ik->i", block, self.covariance[where, where], block)
+        std = np.sqrt(square + np.sum(self.bends[:, slot.slice] ** 2, axis=0))
         # one open coefficient leaves every value of a law open
         return value, np.where(self.is_open[where].any(), np.nan, std), block
+
+    def _is_smooth(self, block):
+        """Return whether a law is a polynomial in wavelength that could bend more."""
+        law = law_basis(self.problem.wavelength, block.shape[1] - 1)
+        is_short = block.shape[1] < len(block) and law.shape == block.shape
+        return is_short and np.allclose(law, block)
+
+    @cached_property
+    def bends(self):
+        """How far free values may be off as laws of causes bend more, root of squares, (n, n_free).
+
+        A bend that the data show too little of to be asked for is more than the errors of a law.
+        """
+        mine, parts = self.problem, [np.empty((0, self.problem.free.size))]
+        added = (p.name for own in self.model.added.values() for p in own)
+        known = {key: getattr(mine, key) for key in ("ties", "neutral", "limits")}
+        smooth = [n for n in added if n in mine.laws and self._is_smooth(mine.laws[n])]
+        # a parameter that has one value for all wavelengths follows no law
+        smooth = [n for n in smooth if n in mine.slices and mine.free.by_name[n].per_wavelength]
+        if smooth:
+            known["laws"] = {n: law for n, law in mine.laws.items() if n not in smooth}
+            free = GapProblem(self.model.trains, self.model.observations, like=mine, **known)
+            slopes = free.jacobian(free.start)
+            parts += [self._bend(n, mine.laws[n], slopes[:, free.slices[n]]) for n in smooth]
+        return np.concatenate(parts)
+
+    def _bend(self, name, block, slopes):
+        """Return the part of one parameter, of derivatives (n_rows, W) to its values.
+
+        Coefficients of up to two degrees more are some share of the size of its law.
+        """
+        mine, linear, where = self.problem, self.model.linear, self.problem.free.by_name[name].slice
+        value = mine.vector(self.model.fit.coefficients)[where] - mine.neutral.get(name, 0.0)
+        size = max(np.mean(value**2), np.finfo(float).tiny / _BENDS[0] ** 2)
+        more = law_basis(mine.wavelength, min(block.shape[1] + 1, len(block) - 2))
+        more = more[:, block.shape[1] :]
+        raw, temper = slopes @ more, max(1.0, self.model.mean_square)
+        left = raw - linear.tangent @ (linear.tangent.T @ raw)
+        gram, target = left.T @ left / temper, left.T @ linear.residual / temper
+        odds, squares = [], []
+        for share in _BENDS:
+            held = np.eye(len(gram)) / (share**2 * size)
+            spread = np.linalg.inv(gram + held)
+            middle = spread @ target
+            odds.append((target @ middle + np.linalg.slogdet(spread @ held)[1]) / 2)
+            squares.append(spread + np.outer(middle, middle))
+        square = np.average(squares, axis=0, weights=np.exp(odds - np.max(odds)))
+        # the other coefficients give way
+        half = self._directions[0]
+        off = -mine.spread(raw.T @ self.model.jacobian @ half.T @ half)
+        off[:, where] += more.T
+        return np.linalg.cholesky(square).T @ off
 
     def unit_of(self, name):
         """Return the unit of a parameter in words, and how much of it is canonical."""
@@ -529,7 +583,8 @@ def _covariance(model, free):
     singular, right, scale = problem.decomposed(model.fit.coefficients)
     known, each = singular > OPEN * singular[0], problem.spread(right / scale)
     sizes = np.sqrt(max(1.0, model.mean_square)) / singular[known, None]
-    return covariance_along(free, sizes * each[known] / free.steps, each[~known] / free.steps)
+    half = np.concatenate([sizes * each[known], Fitted(model).bends])
+    return covariance_along(free, half / free.steps, each[~known] / free.steps)
 
 
 def _median(values):

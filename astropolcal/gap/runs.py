@@ -202,8 +202,9 @@ def _size(parameters, wavelength, times):
         values = np.array(np.ravel(one["value"]), dtype=float)
         errors = np.array(np.ravel(one["std"]), dtype=float)
         clear = np.divide(np.abs(values), errors, out=np.full(errors.shape, -1.0), where=errors > 0)
-        i = int(np.argmax(clear))
         one_of = values.size == len(wavelength) > 1 and np.ptp(values) > 0
+        # of one value for all wavelengths the error is the largest of theirs
+        i = int(np.argmax(clear) if one_of else np.argmin(clear))
         where = f" at {wavelength[i]:.0f} nm" if one_of else ""
         found.append((clear[i], factor * values[i], factor * errors[i], f"{unit}{where}"))
     best = max(found, key=lambda size: size[0])

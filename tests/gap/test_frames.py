@@ -107,6 +107,17 @@ def test_beam_that_was_off_in_one_frame():
         assert abs(fault.value - factor) < 5 * fault.error
 
 
+def test_sums_of_a_lamp_that_drifts_say_by_how_much_a_beam_was_off():
+    """They are compared with what the other frames foresee, as the differences are."""
+    time = np.linspace(-1, 1, N)
+    lamp = np.exp(0.1 * time + 0.1 * time**2 + 0.1 * time**3)
+    for frame, factor in ((1, 0.95), (45, 1.06)):
+        one = data.with_flux(observed(lamp=lamp), np.where(np.arange(N) == frame, factor, 1.0))
+        (fault,) = harmful(found(one))
+        assert fault.what == "one beam"
+        assert abs(fault.value - factor) < 3 * fault.error, (frame, fault.value, fault.error)
+
+
 def test_datum_of_one_wavelength_that_was_off():
     right = observed()
     for frame, k, factor, beam in ((30, 2, 1.1, "right"), (7, 0, 0.97, "left")):

@@ -92,6 +92,22 @@ def test_what_is_the_same_everywhere_is_said_to_be(full):
     assert found["probability_after"] == found["probability_now"] == pytest.approx(0.52)
 
 
+def test_causes_of_a_source_are_not_told_apart_without_its_optic():
+    """Of a chain that begins with the plate no diagnosis asks for causes upstream of it."""
+    where, out = {"hwp": CYCLE, "derotator": 165.0}, ("calibration_polarizer",)
+    waves = [f"harmonic:derotator:{n}" for n in (1, 2)]
+    cells = [CellEffect(Cell("source", "diattenuation_d", wave), 0) for wave in waves]
+    true = cells[0].edit([chain()], Context(WAVELENGTH.to_value(u.um))).chains[0]
+    true["gap_source_diattenuation_d_harmonic_derotator_1"].amplitude = np.full(7, 0.01)
+    full = fitted(observed(true)).with_effect(cells[0])
+    found = [
+        plan(even(full, *cells), candidates=[Exposure(0, where, without=one)])[0]
+        for one in ((), out)
+    ]
+    assert found[0]["probability_after"] > 0.9
+    assert found[1]["probability_after"] == found[1]["probability_now"]
+
+
 def test_what_happened_at_a_frame_is_not_expected_in_another_run(model):
     steps = [CellEffect(Cell("after:hwp", "rotation", f"step:{n}"), 0) for n in (14, 15)]
     assert plan(even(model.with_effect(steps[0]), *steps)) == []

@@ -12,7 +12,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.modeling.fitting import TRFLSQFitter
-from gap_data import WAVELENGTH, chain, frames, observed, with_effect
+from gap_data import WAVELENGTH, chain, fitted, frames, observed, with_effect
 from matplotlib.figure import Figure
 
 from astropolcal import Normal, Observations, calibrate, instruments
@@ -20,6 +20,7 @@ from astropolcal.exceptions import GapError
 from astropolcal.gap import diagnose, get_effect
 from astropolcal.gap.attribution import Candidate
 from astropolcal.gap.cells import Cell
+from astropolcal.gap.effects import Context
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.model import nominal_model
 from astropolcal.gap.problem import GapProblem
@@ -224,6 +225,22 @@ def test_angles_of_cells_are_in_degrees(found):
     assert entry["unit"] == "deg"
     size = radian.basis @ model.fit.coefficients[model.problem.slices[radian.name]]
     assert entry["value"] == pytest.approx(np.rad2deg(size))
+
+
+def test_errors_of_a_law_know_of_bends_that_the_data_hardly_show():
+    """A gain that is one number, of light whose gain changes a little with the wavelength."""
+    effect = CellEffect(Cell("detector", "gain", "constant"), 0)
+    edit = effect.edit([chain()], Context(WAVELENGTH.to_value(u.um)))
+    name, line = edit.parameters[0].name, np.linspace(-1, 1, len(WAVELENGTH))
+    for bend in (0, 0.03, 0.05):
+        true = SIZE * (1 + bend * line)
+        edit.chains[0][name.split(".")[0]].amplitude = true
+        report = Fitted(fitted(observed(edit.chains[0], noise=False)).with_effect(effect))
+        (size,) = report.sizes(effect.name).values()
+        std, rows = np.array(size["std"]), report.problem.slices[name]
+        assert np.all(np.abs(size["value"] - true) < 1.5 * std), bend
+        # they hardly grow where there is no bend
+        assert bend or std.max() < 1.4 * np.sqrt(report.covariance[rows, rows].item())
 
 
 @pytest.mark.slow

@@ -169,8 +169,8 @@ def test_sizes_are_in_units_that_people_use():
         )
     )
     assert lines == [
-        "b: 1.000 to 2.000 deg, median 1.500, errors 0.011 to 0.10 deg, if it is a polynomial of "
-        "degree 2 in wavelength; determined at 2 of 3 wavelengths",
+        "b: 1.000 to 2.000 deg, median 1.500, errors 0.011 to 0.10 deg, if it is nearly a "
+        "polynomial of degree 2 in wavelength; determined at 2 of 3 wavelengths",
         "c: not determined by these data at any wavelength",
         "long name: 1.235 +- 0.012 %",
         "e: 1.00 +- 0.10 % at every wavelength",
