@@ -54,6 +54,8 @@ __all__ = ["Change", "changes", "courses", "parameter_history", "restart"]
 
 # a direction less certain than this share of the most certain one tells nothing
 _RANK = 1e-12
+# a direction shorter than this is rounding; with a sine up to that two open ones are the same
+_SHORT, _TURNED = 1e-5, 0.3
 # degrees by which a retardance, or an orientation, is the same again
 _PERIODS = {"retardance": 360.0, "theta": 180.0}
 # of a history
@@ -315,19 +317,22 @@ def compared(named, parameters=None):
     left_out = [name for name in names if name in stuck]
     names = [name for name in names if name not in stuck]
     places = [[space.names.index(name) for name in names] for space in spaces]
-    # compared is only what every calibration knows: rows of `basis` are orthogonal to all that is
-    # open in any of them
+    # compared is only what every calibration knows
     opens = [_left_open(calibration, a) for (_, calibration), a in zip(named, axes, strict=True)]
-    basis = _determined([o[:, p] for o, p in zip(opens, places, strict=True)], len(names))
+    opens = [o[:, p] for o, p in zip(opens, places, strict=True)]
+    basis, leads = _in_one_gauge(opens, len(names))
     steps = axes[0].steps[places[0]]
     values = [_values(calibration, names) for _, calibration in named]
     # another turn is no change
     for own in values[1:]:
         turned = zip(own, values[0], names, strict=True)
         own[:] = [_in_turn(value, first, name) for value, first, name in turned]
-    values = [basis @ (own / steps) for own in values]
+    apart = [(own - values[0]) / steps for own in values]
+    # on the way what is open turns to that of the first: half of its turn counts
+    values = [(basis + lead) / 2 @ own for lead, own in zip(leads, apart, strict=True)]
     known = [
-        (a.known * a.sigmas[:, None])[:, p] @ basis.T for a, p in zip(axes, places, strict=True)
+        (a.known * a.sigmas[:, None])[:, p] @ lead.T
+        for a, p, lead in zip(axes, places, leads, strict=True)
     ]
     kept, deviations, weights = about_the_mean(values, [k.T @ k for k in known])
     slopes = kept.T @ basis / steps
@@ -393,6 +398,26 @@ def _determined(opens, size):
     _, singular, vectors = np.linalg.svd(rows, full_matrices=True)
     rank = int(np.sum(singular > 1e-5 * max(singular.max(initial=0.0), 1.0)))
     return vectors[rank:]
+
+
+def _orthonormal(rows, least=_SHORT):
+    """Return an orthonormal basis of what rows span by more than a length."""
+    _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
+    return vectors[singular > least]
+
+
+def _in_one_gauge(opens, size):
+    """Return the directions that are open in no calibration, and what leads to them in each.
+
+    What is open in two of them turns with the values of the parameters, and is the same all the
+    same: each is moved along what is open in it, to where the first stands, (n_directions, size).
+    """
+    common, opens = np.zeros((0, size)), [_orthonormal(rows) for rows in opens]
+    for own in opens:
+        common = np.concatenate([common, _orthonormal(own - own @ common.T @ common, _TURNED)])
+    basis = _determined([common], size)
+    along = (own.T @ np.linalg.pinv(common @ own.T) @ common for own in opens)
+    return basis, [basis - basis @ way for way in along]
 
 
 def changes(calibrations, parameters=None):

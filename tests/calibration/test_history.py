@@ -25,6 +25,7 @@ from astropolcal.pipeline.history import (
     Change,
     _log_p,
     changes,
+    courses,
     parameter_history,
     restart,
     significance,
@@ -173,6 +174,31 @@ def test_open_directions_do_not_count():
     alone = significance([first, second], ["hwp.theta"])
     assert (alone.dof, alone.p_value, alone.sigma) == (0, 1.0, 0.0)
     assert "nothing that is determined" in str(alone)
+
+
+@pytest.mark.slow
+def test_what_is_open_in_all_takes_no_more_with_each_run_nor_in_another_gauge():
+    """What is open turns a little from fit to fit; of seven runs nothing was left to compare."""
+    free, moved, runs = "elliptical", 0.5 * u.deg, []
+    for i in range(7):
+        truth = make_chain(free)
+        if i > 3:
+            truth["derotator"].horizontal = truth["derotator"].horizontal.quantity + moved
+        meta = CHARIS.published_meta() | {"date": f"202{i}-02-01", "yjh50_dichroic": "out"}
+        data = simulate(truth, WAVELENGTH, FRAMES, seed=i, meta=meta, name=f"run{i}")
+        start, gauge = make_chain(free), "minimal"
+        if i == 1:
+            start["hwp"].theta, gauge = 3.0 * u.deg, None
+        runs.append(calibrate(start, data, instrument="charis", search=False, gauge=gauge))
+    assert abs(runs[1].chain["hwp"].theta.value - runs[0].chain["hwp"].theta.value) > 1
+    for k in range(2, 8):
+        found = significance(runs[:k])
+        assert (found.n_open, found.dof) == (2, 15 * (k - 1))
+        assert (found.sigma > 15) == (k > 4), found
+        assert (found.sigma < 4) == (k < 5), found
+    (row,) = courses(runs, ["derotator"])
+    assert row["course"] == "steps"
+    assert row["change"].round(2).tolist() == [0, 0, 0, 1, 0, 0]
 
 
 def test_what_a_prior_closes_does_not_count():

@@ -13,6 +13,7 @@ from astropolcal import calibrate
 from astropolcal.calibration import fitted_stars, star_check, target_accuracies
 from astropolcal.calibration.validation import paper_accuracies, star_accuracy, star_stokes
 from astropolcal.calibration.validation.cross_validation import standard_accuracy
+from astropolcal.calibration.validation.stars import _pull
 from astropolcal.chain import leaves, replace_optic
 from astropolcal.exceptions import AstropolcalWarning, ChainError, FitError
 from astropolcal.instruments.telescope import published_mirror
@@ -142,6 +143,24 @@ def test_chain_without_a_star_is_an_error(simulated):
     cal, truth = simulated
     with pytest.raises(ChainError, match="begins with a PolarizedSource"):
         star_stokes(cal, CHARIS.chain(), observe_star(truth, 2, noise=False))
+
+
+def test_a_star_is_as_many_errors_off_whether_it_is_polarized_or_not():
+    """Without polarization it is q and u that are off, and no star was right within its errors."""
+    rng, off, n = np.random.default_rng(3), [], 400
+    for degree in (1.0, 0.0):
+        errors = rng.standard_normal((n, 2))
+        table = QTable({"wavelength": np.linspace(1.2, 2.2, n) * u.um})
+        for key, value, error in zip("qu", (degree, 0.0), errors.T, strict=True):
+            table[key] = (value + 0.1 * error) * u.percent
+            table[f"{key}_cycles"] = table[key][:, None]
+        table.update(star_accuracy(table, q=degree / 100))
+        for key, value in {"_known": degree, "_err": 0.08, "_sys_err": 0.06}.items():
+            table[f"dolp{key}"] = np.full(n, value) * u.percent
+        table["dolp_known_err"] = np.full(n, np.nan) * u.percent
+        off.append([float(_pull(table[[i]], "dolp").split()[0]) for i in range(n)])
+    rms = np.sqrt(np.mean(np.square(off), axis=1))
+    np.testing.assert_allclose(rms, 1, atol=0.1)
 
 
 def test_polarized_standard_is_predicted_from_the_catalogue(simulated):

@@ -399,7 +399,9 @@ def _pull(table, key):
     known = {whose: part for whose, part in parts.items() if not np.isnan(part).all()}
     if not known:
         return "no error is known"
-    stated = np.sqrt(sum(part**2 for part in known.values()))
+    # where there is no polarization q and u are off, each by an error of its own
+    both = (key == "dolp") & (table["dolp_known"].value == 0)
+    stated = np.sqrt(np.where(both, 2, 1) * sum(part**2 for part in known.values()))
     times = np.nanmedian(np.abs(table[f"{key}_error"].value) / stated)
     return f"{times:.1f} times the errors of {listed(known)}"
 
