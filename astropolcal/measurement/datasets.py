@@ -202,6 +202,15 @@ class Dataset:
         predicted = self.observable.evaluate(*self._fluxes(sweep))
         return predicted.ravel() if self._all_valid else predicted[self.valid]
 
+    def of_lamp(self, sweep):
+        """Return what the data gain where frames are as bright as in the table, (n_data,)."""
+        right, left = self._fluxes(sweep)
+        observed = self.observations.flux_right + self.observations.flux_left
+        observed = self._grouped(observed[self.frames.T.ravel()].T)
+        bright = np.where(self.valid, observed, 1.0) / np.where(self.valid, right + left, 1.0)
+        with_lamp = self.observable.evaluate(right * bright, left * bright)
+        return with_lamp[self.valid] - self.values(sweep)
+
     def forward(self, vector):
         """Return the forward sweep at a vector of free parameters."""
         return self.propagator.forward(self.current_values(vector))

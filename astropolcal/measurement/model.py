@@ -276,6 +276,14 @@ class Measurement(ScalarParameters):
         parts = [d.values(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
+    def of_lamp(self, vector):
+        """Return what all predicted data gain by the brightness of each frame, (n_data,)."""
+        if self.observable.name == "intensity":
+            # in which the brightness is free anyway
+            return np.zeros(self.n_data)
+        pairs = zip(self.datasets, self._sweeps(vector), strict=True)
+        return np.concatenate([dataset.of_lamp(sweep) for dataset, sweep in pairs])
+
     def jacobian(self, vector, among=None):
         """
         Return the derivative of all data to all free parameters, (n_free, n_data).

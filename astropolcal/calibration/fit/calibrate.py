@@ -395,6 +395,8 @@ _SPOILT = 1e-3
 _SILENT = 1e-12
 # a datum whose fit leaves less than this of what it departs says nothing but of itself
 _ALONE = 1e-6
+# errors by which the lamp may move a parameter without making its errors longer by a tenth
+_LITTLE = 0.45
 # a fit is at odds with a prior that is so many of its standard deviations away
 _FAR = 4.0
 
@@ -521,6 +523,7 @@ def _result(fitted, covariance=None):
     if covariance is None:
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
+        own, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own)
     stds = own.stds * measurement.free.factors()
     others = fit.pop("others", ()), fitted.lawful
     signs, errors_of_signs = undecided_signs(measurement, view, stds, *others)
@@ -595,26 +598,45 @@ def _against_prior(measurement, whitened, covariance):
     return {"parameter": names[own[worst]], "sigma": float(off[worst]), "moves": moved}
 
 
+def _beside_lamp(measurement, whitened, covariance):
+    """Return a covariance that knows of the lamp, and which parameter this moves most.
+
+    Where a lamp changes between the frames of a difference, the model has both equally bright.
+    """
+    problem, vector = Problem(measurement, measurement.weighting), measurement.vector()
+    rows, priors = problem.jacobian(vector) * whitened.scale, np.zeros(measurement.n_priors)
+    pull = np.concatenate([measurement.of_lamp(vector) * problem.weights, priors])
+    step, moved = _moved_by(whitened, rows, pull, covariance, measurement)
+    if moved["errors"] > _LITTLE:
+        covariance = covariance.beside(np.where(covariance.stds > 0, step, 0.0)[None])
+    return covariance, moved
+
+
+def _moved_by(whitened, rows, pull, covariance, measurement, among=True):
+    """Return a step of Newton's, and by how many errors it moves which parameter most."""
+    free, factor = measurement.free, whitened.factor()
+    step = factor.T @ (factor @ (rows.T @ pull)) * whitened.scale / free.factors()
+    # of data without noise residuals are rounding
+    known = (covariance.stds > 0) & (rms(measurement.residuals()) > ROUNDED) & among
+    times = np.divide(np.abs(step), covariance.stds, out=np.zeros(free.size), where=known)
+    worst = int(np.argmax(times))
+    return step, {"parameter": free.names[worst], "errors": float(times[worst])}
+
+
 def _moved(measurement, whitened, covariance, data=None, among=True):
     """Return which parameter residuals move most, by how many errors; at the minimum none does.
 
     Of some data: by how much it would move without them (Cook 1977, Technometrics 19, 15). Priors
     count as data after all others.
     """
-    problem, free = Problem(measurement, measurement.weighting), measurement.free
-    vector, factor = measurement.vector(), whitened.factor()
+    problem, vector = Problem(measurement, measurement.weighting), measurement.vector()
     rows, pull = problem.jacobian(vector) * whitened.scale, problem.residuals(vector)
     if data is not None:
         rows, pull = rows[data], pull[data]
         # how far each of them draws the fit to itself
-        drawn = rows @ factor.T
+        drawn = rows @ whitened.factor().T
         pull = np.linalg.lstsq(np.eye(len(data)) - drawn @ drawn.T, pull, rcond=_ALONE)[0]
-    # a step of Newton's; of data without noise residuals are rounding
-    step = np.abs(factor.T @ (factor @ (rows.T @ pull))) * whitened.scale / free.factors()
-    known = (covariance.stds > 0) & (rms(measurement.residuals()) > ROUNDED) & among
-    times = np.divide(step, covariance.stds, out=np.zeros(free.size), where=known)
-    worst = int(np.argmax(times))
-    return {"parameter": free.names[worst], "errors": float(times[worst])}
+    return _moved_by(whitened, rows, pull, covariance, measurement, among)[1]
 
 
 def _lack_of_fit(calibration, whitened):

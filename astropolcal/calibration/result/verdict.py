@@ -121,6 +121,12 @@ def verdict(calibration, targets=TARGETS):
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
+        lamp = calibration.fit.get("lamp_moves") or {"errors": 0.0}
+        if lamp["errors"] > 1:
+            cautions.append(
+                f"the lamp changes within pairs of frames and moves {lamp['parameter']} by "
+                f"{lamp['errors']:.2g} errors, now in them (observable per_frame_double_difference)"
+            )
         if "restarted" in calibration.settings:
             cautions.append("errors of parameters lack those of what is held")
         cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
