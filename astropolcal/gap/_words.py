@@ -50,6 +50,7 @@ _AMPLITUDES = {
     "step": "step",
     "direction": "change after moves backwards",
     "move": "change with a move of one radian",
+    "brightness": "change where the source is twice as bright",
 }
 # which of them the coefficient of a law is that a parameter follows, by the end of its name
 _OF_LAWS = {

@@ -102,6 +102,9 @@ class Cell:
     @property
     def scale(self):
         """Usual size, in radian or as a share."""
+        if split_run(self.dependence)[0] == "brightness":
+            # data hardly tell it from a background, nor should the usual sizes
+            return _SIZES["background"][0]
         return _SIZES.get(self.kind.partition("_")[0], _USUAL)[0]
 
     @property
@@ -153,6 +156,7 @@ _PATTERNS = {
     "direction": " that depends on the direction of the last move of the {0}",
     "state": " where {0}",
     "move": " that grows with the last move of the {0}",
+    "brightness": " that follows its brightness",
 }
 _TIMES = {"1": "once", "2": "twice", "4": "four times"}
 
@@ -286,6 +290,8 @@ def dependences(problem):
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
     names += [f"state:{stage}" for stage in given if "=" in stage]
     names += [f"{what}:{s}" for s in stages for what in _MOVED]
+    # of one beam the sums follow the modulation
+    names += ["brightness"] * all(channel.groups is None for channel in problem.channels)
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
     n = min(d.observations.n_frames for d in problem.datasets)
@@ -374,6 +380,9 @@ class Probes:
             names = [name for name in names if split_run(name)[0].partition(":")[0] in allowed]
         if kind in DETECTED:
             return [DETECTED[kind], *names]
+        if place != "source":
+            # nothing else knows how bright it is, and a detector has its own laws
+            names = [name for name in names if split_run(name)[0] != "brightness"]
         if len(self.slopes[place, kind]) > 1:
             return names
         # a place in one chain only is in that run anyway

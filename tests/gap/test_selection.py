@@ -106,6 +106,19 @@ def test_a_background_may_grow_and_one_beam_may_bend():
 
 
 @pytest.mark.slow
+def test_a_lamp_whose_polarization_follows_its_flux_is_told_beside_a_background():
+    """To first order both do the same: a lamp of less flux has a larger share of background."""
+    setup = SETUPS["charis"]()
+    how = {"lamp": np.random.default_rng(4).uniform(0.98, 1.02, len(setup.frames)), "seed": 3}
+    lamp, background = "source/depolarization_linear/brightness", "detector/background/flux"
+    follows = setup.with_cell(Cell(*lamp.split("/")), 0.1)
+    for seen in (setup.observed(follows, **how), setup.with_detector("background", 0.05, **how)):
+        (group,) = chosen(setup, seen).groups
+        assert group.probability > 0.9
+        assert {lamp, background} <= set(names(group)), names(group)
+
+
+@pytest.mark.slow
 def test_two_planted_causes_are_both_found_and_left_out_frames_agree():
     setup = SETUPS["charis"]()
     first = Cell("in:derotator", "retardance_h", "time")
