@@ -43,7 +43,7 @@ _COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
-_HARMONICS = (1, 2, 4)
+_HARMONICS = (1, 2, 3, 4)
 # steps are looked for at so many frames, and the best of them at those in between
 _MOST_STEPS = 16
 # functions of the frame that differ by less are the same
@@ -158,7 +158,7 @@ _PATTERNS = {
     "move": " that grows with the last move of the {0}",
     "brightness": " that follows its brightness",
 }
-_TIMES = {"1": "once", "2": "twice", "4": "four times"}
+_TIMES = {"1": "once", "2": "twice", "3": "three times", "4": "four times"}
 
 
 def _kind_words(cell):
