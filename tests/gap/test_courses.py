@@ -117,6 +117,7 @@ def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
     for seed, small, course, place, kind in (
         (3, (7, 8), "both stages", "after:hwp", "diattenuation_d"),
         (4, (4, 6), "swings", "in:derotator", "retardance_h"),
+        (4, (5, 6), "third harmonic", "after:derotator", "diattenuation_h"),
     ):
         how = {"kind": "mechanism", "snr": 20, "setup": Setup("charis", None, *small)}
         how["fault"] = {"what": "course", "course": course, "place": place, "kind": kind}
@@ -130,18 +131,6 @@ def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
         assert any("course through the run" in line for line in content["sentences"]), course
         cells = [one["cell"] for one in content["where"] if one["axis"] == "course"]
         assert {"place": place, "kind": kind, "dependence": None} in cells, course
-
-
-@pytest.mark.slow
-def test_what_changes_three_times_in_a_turn_is_in_the_table():
-    """Few angles of a quarter turn hardly tell it from two lobes, which were named instead."""
-    fault = {"what": "course", "course": "third harmonic"}
-    fault |= {"place": "after:derotator", "kind": "diattenuation_h"}
-    setup = Setup("charis", None, 5, 6)
-    diagnosis, content, score = answered(4, kind="mechanism", snr=20, setup=setup, fault=fault)
-    (cause,) = diagnosis.causes
-    assert (score, cause.name) == ("right", "after:derotator/diattenuation_h/harmonic:derotator:3")
-    assert "three times in a turn" in content["causes"][0]["title"]
 
 
 @pytest.mark.slow
