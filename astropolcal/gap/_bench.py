@@ -70,6 +70,8 @@ _COURSES = {
     "third harmonic": lambda t, s, both, phase, x, walk: np.cos(3 * s + phase),
     "bends": lambda t, s, both, phase, x, walk: np.abs(np.sin(s + phase)),
 }
+# what a background may do
+_FOLLOWED = ("time", "step", "harmonic")
 # the largest size: radian, or a share
 _LARGEST, _LARGEST_SHARE = 0.2, 0.3
 # what the nominal model takes up leaves less than this share of itself
@@ -406,12 +408,15 @@ class Bench:
         )  # fmt: skip
         return -fit.fun, fit
 
-    def _cells(self, vector, own=None, law=None):
-        """Yield name and whitened columns of each cell of places, kinds and dependences."""
+    def _cells(self, vector, more=(), law=None):
+        """Yield name and whitened columns of each cell of places, kinds and dependences.
+
+        With ``more`` dependences, those of a background that follows something are among them.
+        """
         law = self.law if law is None else law
         values, n_sets = self._values(vector), range(len(self.clean))
         flux = [self.path(d, values=values) for d in n_sets]
-        names = dict.fromkeys([*self.dependences, *([own] if own else [])])
+        names = dict.fromkeys([*self.dependences, *more])
         waves = {name: [self.waves(d, name) for d in n_sets] for name in names}
         for place, (kind, action) in product(self.places, ACTIONS.items()):
             # to first order what is added to the light goes on as all light does
@@ -419,11 +424,15 @@ class Bench:
             for name, wave in waves.items():
                 yield f"{place}/{kind}/{name}", self._columns(flux, slopes, wave, law)
         still = waves["constant"]
+        followed = {n: w for n, w in waves.items() if more and n.startswith(_FOLLOWED)}
         for kind in ("gain", *DETECTOR):
             slopes = [self.glow(d, kind, flux[d]) for d in n_sets]
             beams = np.ones((1, 2)) if kind in ("gain", "background") else np.eye(2)
             own = [[s * on[:, None, None] for s in slopes] for on in beams]
-            for name, wave in waves.items() if kind == "gain" else [(DETECTOR[kind], still)]:
+            known = waves if kind == "gain" else {DETECTOR[kind]: still}
+            if kind.startswith("background"):
+                known = known | followed
+            for name, wave in known.items():
                 columns = [self._columns(flux, one, wave, law) for one in own]
                 yield f"detector/{kind}/{name}", np.concatenate(columns)
 
@@ -460,7 +469,8 @@ class Bench:
         taken = np.linalg.qr(fit.jac[:, kept])[0]
         signal = residual - taken @ (taken.T @ residual)
         found = {}
-        for name, columns in self._cells(fit.x, own, np.eye(len(self.micron)) if sharp else None):
+        more = [f"harmonic:{stage}:3" for stage in ("hwp", "derotator")] + [own] * bool(own)
+        for name, columns in self._cells(fit.x, more, np.eye(len(self.micron)) if sharp else None):
             length = np.linalg.norm(columns, axis=1)
             columns = (columns[length > 0] / length[length > 0, None]).T
             columns = columns - taken @ (taken.T @ columns)

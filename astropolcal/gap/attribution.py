@@ -46,6 +46,7 @@ _DEPENDENCE = {
     "direction": -1.5,
     "move": -1.5,
     "time2": -1.0,
+    "brightness": -1.5,
     "dataset": 0.0,
 }
 _OTHER = -0.5
@@ -284,7 +285,7 @@ def _sharpest(probes, temper, least):
     """
     found = []
     for (place, kind), slopes in probes.slopes.items():
-        scale, tables = Cell(place, kind, "constant").scale, probes.by_wavelength(slopes)
+        tables = probes.by_wavelength(slopes)
         for names, waves in probes.grouped(probes.dependences_of(place, kind)):
             target, gram = (
                 sum(
@@ -295,6 +296,7 @@ def _sharpest(probes, temper, least):
             )
             gram, target = (x.reshape(len(names), -1) for x in (gram, target))
             share = np.divide(target**2, gram, out=np.zeros_like(gram), where=gram > 0)
+            scale = np.array([Cell(place, kind, name).scale for name in names])
             factors = log_factor(gram, share, scale, temper)
             found += [(f + _prior(n), place, kind, n) for f, n in zip(factors, names, strict=True)]
     found = sorted((one for one in found if one[0] > least), reverse=True)
@@ -335,19 +337,20 @@ def _of_cell(probes, cell, degree, temper, others=()):
 
 def _candidates(place, kind, names, by_law, temper):
     """Return the candidates of dependences from (degree, normal equations), of the better law."""
-    scale, best = Cell(place, kind, "constant").scale, {}
+    cells, best = [Cell(place, kind, name) for name in names], {}
+    scales = np.array([cell.scale for cell in cells])
     for degree, (gram, target) in by_law:
         values, share = _spectra(gram, target)
-        factors, ranks = log_factor(values, share, scale, temper), _rank(values, scale)
+        factors, ranks = log_factor(values, share, scales, temper), _rank(values, scales)
         for i in np.flatnonzero(ranks):
             if i not in best or best[i][0] < factors[i]:
                 best[i] = (factors[i], int(ranks[i]), values[i], share[i], degree)
     found = []
     for i, (factor, rank, values, share, degree) in best.items():
         prior = _prior(names[i])
-        evidence, spectrum = float(factor) + prior, (values, share, scale)
-        cell, statistic = Cell(place, kind, names[i]), float(share.sum())
-        found.append(Candidate(None, cell, statistic, rank, evidence, prior, spectrum, degree))
+        evidence, spectrum = float(factor) + prior, (values, share, float(scales[i]))
+        statistic = float(share.sum())
+        found.append(Candidate(None, cells[i], statistic, rank, evidence, prior, spectrum, degree))
     return found
 
 
@@ -368,8 +371,9 @@ def _spectra(gram, target):
 
 
 def log_factor(values, share, scale, temper):
-    """Return the log Bayes factor against no such cause, of (..., k) arrays."""
-    spreads = np.square(scale * np.array(_SIZES)).reshape(-1, *[1] * values.ndim) / temper
+    """Return the log Bayes factor against no such cause, of (..., k) arrays and (...) sizes."""
+    scale = np.broadcast_to(scale, values.shape[:-1])[..., None]
+    spreads = np.square(np.multiply.outer(_SIZES, scale)) / temper
     gains = share / temper * (spreads * values / (1 + spreads * values))
     each = 0.5 * (gains - np.log1p(spreads * values)).sum(axis=-1)
     return np.logaddexp.reduce(each, axis=0) - np.log(len(_SIZES))
@@ -377,7 +381,7 @@ def log_factor(values, share, scale, temper):
 
 def _rank(values, scale):
     """Return in how many directions even a large size would show."""
-    return (np.square(scale * _SIZES[-1]) * values > 1).sum(axis=-1)
+    return (np.square(np.asarray(scale)[..., None] * _SIZES[-1]) * values > 1).sum(axis=-1)
 
 
 def _named(probes, effects, temper, degree="default", others=()):

@@ -19,6 +19,7 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.problem import GapProblem
+from astropolcal.observations.grid import clusters
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.optics.positions import COORDINATES
 
@@ -36,9 +37,9 @@ _DETECTED = {
 }
 #: Kinds that only a detector may have, and the dependence of each.
 DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
-# of these some may also drift or step; an angle may do that, too, and what follows a stage has a
-# name
-_COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step"))
+# of these some may also drift, step or follow a stage; an angle may do that, too, and the harmonics
+# of an encoder have names
+_COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step", "harmonic"))
 _COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
@@ -102,6 +103,9 @@ class Cell:
     @property
     def scale(self):
         """Usual size, in radian or as a share."""
+        if split_run(self.dependence)[0] == "brightness":
+            # data hardly tell it from a background, nor should the usual sizes
+            return _SIZES["background"][0]
         return _SIZES.get(self.kind.partition("_")[0], _USUAL)[0]
 
     @property
@@ -153,8 +157,9 @@ _PATTERNS = {
     "direction": " that depends on the direction of the last move of the {0}",
     "state": " where {0}",
     "move": " that grows with the last move of the {0}",
+    "brightness": " that follows its brightness",
 }
-_TIMES = {"1": "once", "2": "twice", "4": "four times"}
+_TIMES = {"1": "once", "2": "twice", "3": "three times", "4": "four times"}
 
 
 def _kind_words(cell):
@@ -284,8 +289,12 @@ def dependences(problem):
     stages = [stage for stage in given if stage not in COORDINATES and stage not in _SKY]
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
+    # a stage that takes each angle once has a course in time, and of these there are enough
+    names += [f"harmonic:{stage}:3" for stage in stages if _comes_back(stage, problem)]
     names += [f"state:{stage}" for stage in given if "=" in stage]
     names += [f"{what}:{s}" for s in stages for what in _MOVED]
+    # of one beam the sums follow the modulation
+    names += ["brightness"] * all(channel.groups is None for channel in problem.channels)
     several = [d.observations.name for d in problem.datasets]
     runs = several if count_runs(problem) > 1 else []
     n = min(d.observations.n_frames for d in problem.datasets)
@@ -304,6 +313,14 @@ def dependences(problem):
         if name == "constant" or _varies(waves, problem):
             found[name] = waves
     return found
+
+
+def _comes_back(stage, problem):
+    """Return whether a stage takes angles again after others, in each dataset that has it."""
+    angles = [d._given[stage] for d in problem.datasets if stage in d._given]
+    angles = [a.mean(axis=0) if a.ndim == 2 else a for a in angles]
+    numbers = [clusters(angle, turn=2 * np.pi) for angle in angles]
+    return all(np.count_nonzero(np.diff(number)) > number.max() for number in numbers)
 
 
 def _varies(waves, problem):
@@ -374,6 +391,9 @@ class Probes:
             names = [name for name in names if split_run(name)[0].partition(":")[0] in allowed]
         if kind in DETECTED:
             return [DETECTED[kind], *names]
+        if place != "source":
+            # nothing else knows how bright it is, and a detector has its own laws
+            names = [name for name in names if split_run(name)[0] != "brightness"]
         if len(self.slopes[place, kind]) > 1:
             return names
         # a place in one chain only is in that run anyway

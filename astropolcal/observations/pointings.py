@@ -445,6 +445,8 @@ def frame_coordinate(observations, name):
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
     if name == "flux":
         return np.where(observations.mask.T, 0.0, fluxes)
+    if name == "brightness":
+        return _brightness(fluxes.sum(axis=0), ~observations.mask.T)
     if name == "total_flux":
         # both entries alike: what depends on all of the light acts on both beams alike
         return np.where(observations.mask.T, 0.0, fluxes.sum(axis=0))[None].repeat(2, axis=0)
@@ -455,6 +457,15 @@ def frame_coordinate(observations, name):
         now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
         ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def _brightness(flux, seen):
+    """Return by what share frames are brighter than the mean of all, (F,), from tables (B, F)."""
+    flux = np.where(seen, flux, 0.0)
+    usual = flux.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    # as much as a usual frame has in the wavelengths that this one has
+    usual = usual @ seen
+    return np.divide(flux.sum(axis=0), usual, out=np.ones_like(usual), where=usual != 0) - 1
 
 
 def _place(observations, name):

@@ -351,12 +351,12 @@ class Observations:
             and ``"derotator_next"``, how far it goes next, so also of any other stage;
             ``"flc_state"``, 0 or 1 for the states A and B of a modulator; ``"parallactic_rate"``,
             ``"hwp_rate"`` and ``"derotator_rate"``, by how much that angle changes from one frame
-            to the next, in radian, so also of any other stage; ``"flux"``, the fluxes of the beams
-            in the unit of the table, 0 where masked;
-            ``"total_flux"``, the sum of both, once for each; ``"previous_flux"``, the fluxes over
-            those of the frame taken before, 1 for the first and where one of the two is masked. For
-            laws of parameters also ``"time"``, a Modified Julian Date (UTC), and ``"x"`` and
-            ``"y"``, the place in the field in arcsec.
+            to the next, in radian, so also of any other stage; ``"brightness"``, by what share the
+            frame is brighter than the mean of the table; ``"flux"``, the fluxes of the beams in the
+            unit of the table, 0 where masked; ``"total_flux"``, the sum of both, once for each;
+            ``"previous_flux"``, the fluxes over those of the frame taken before, 1 for the first
+            and where one of the two is masked. For laws of parameters also ``"time"``, a Modified
+            Julian Date (UTC), and ``"x"`` and ``"y"``, the place in the field in arcsec.
 
         Returns
         -------

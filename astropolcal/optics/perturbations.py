@@ -52,8 +52,9 @@ class Dependence:
     ``"step:N"``, from frame N on; ``"frame:N"``, in frame N alone; ``"harmonic:STAGE:N"``, cosine
     and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
     stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
-    ``"state:COLUMN=STATE"``, in one state of a device or one beam; ``"dataset:NAME"``, in one
-    dataset only. With ``"/dataset:NAME"`` after it, any of the others is in that dataset only.
+    ``"state:COLUMN=STATE"``, in one state of a device or one beam; ``"brightness"``, by what share
+    the frame is brighter than the mean; ``"dataset:NAME"``, in one dataset only. With
+    ``"/dataset:NAME"`` after it, any of the others is in that dataset only.
     """
 
     def __init__(self, text):
@@ -61,7 +62,8 @@ class Dependence:
             raise ParameterError(
                 f"dependence = {text!r}; allowed are constant, time, time2, step:FRAME, "
                 "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, "
-                "state:COLUMN=STATE and dataset:NAME, each also with /dataset:NAME after it"
+                "state:COLUMN=STATE, brightness and dataset:NAME, each also with "
+                "/dataset:NAME after it"
             )
         self.text = text
         #: Name of the one dataset in which it is, None where it is in all.
@@ -81,6 +83,8 @@ class Dependence:
             return self.parts[1]
         if self.kind in ("direction", "move"):
             return f"{self.parts[1]}_{self.kind}"
+        if self.kind == "brightness":
+            return self.kind
         return "frame" if self.kind in ("step", "frame") else "sequence"
 
     def waves(self, position):
@@ -94,12 +98,12 @@ class Dependence:
             return np.array([x >= at if self.kind == "step" else x == at], dtype=float)
         one, t = np.ones_like(x), 2 * x - 1
         known = {"constant": one, "dataset": one, "time": t, "time2": t**2 - 1 / 3}
-        # direction, move and state are what they follow
+        # direction, move, state and brightness are what they follow
         return known.get(self.kind, x)[None]
 
 
 _FORMS = re.compile(
-    r"(constant|time2?|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+"
+    r"(constant|time2?|brightness|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+"
     r"|state:\w+=[^/:]+)"
     r"(/dataset:.+)?|dataset:.+",
     re.DOTALL,
@@ -152,8 +156,9 @@ class Perturbation(_BeamOptic, _Modulated):
         ``"constant"``; ``"time"`` and ``"time2"``, a trend through the run and its square;
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
         times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
-        stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"dataset:NAME"``; each also with
-        ``"/dataset:NAME"`` after it. The ``mount`` has to be what it follows.
+        stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"brightness"``, by what share the
+        frame is brighter than the mean; ``"dataset:NAME"``; each also with ``"/dataset:NAME"``
+        after it. The ``mount`` has to be what it follows.
     beam : {"right", "left"}
         The beam that goes on in a chain; of consequence for ``"gain"`` only.
     theta : `~astropy.units.Quantity`

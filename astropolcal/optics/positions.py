@@ -38,12 +38,14 @@ class _Coordinates(tuple):
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a
 #: modulator (0 or 1), the number of the frame, the change of an angle from frame to frame and the
 #: last moves of stages (those of ``hwp`` and ``derotator``, and ``"STAGE_direction"`` and so on of
-#: any other), and the fluxes; and ``"COLUMN=STATE"``, 1 in the frames whose column has that state
-#: and 0 in the others. Laws of parameters also take ``"time"``, a Modified Julian Date or
-#: `~astropy.time.Time`, and ``"x"`` and ``"y"``, the place in the field in arcsec.
+#: any other), the fluxes, and the brightness of a frame against the mean of its table; and
+#: ``"COLUMN=STATE"``, 1 in the frames whose column has that state and 0 in the others. Laws of
+#: parameters also take ``"time"``, a Modified Julian Date or `~astropy.time.Time`, and ``"x"`` and
+#: ``"y"``, the place in the field in arcsec.
 COORDINATES = _Coordinates(
     (
-        *("sequence", "flc_state", "frame", "parallactic_rate", *FLUXES),
+        *("sequence", "flc_state", "frame", "parallactic_rate", "brightness"),
+        *FLUXES,
         *(f"{stage}{what}" for stage in ("hwp", "derotator") for what in MOVES),
     )
 )

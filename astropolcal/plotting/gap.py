@@ -438,7 +438,11 @@ def _size_panel(axes, problem, size, parameter):
 
 # ---- what a cause depends on ------------------------------------------------------------------
 
-_DRIVERS = {"sequence": "share of the run", "frame": "frame"}
+_DRIVERS = {
+    "sequence": "share of the run",
+    "frame": "frame",
+    "brightness": "brightness over its mean, minus 1",
+}
 
 
 def _curve(model, cause):

@@ -110,7 +110,7 @@ class Setup:
         # what a cell may follow is known once there are frames
         extra = [stage for stage in stages(truth) if stage not in table.colnames]
         if extra:
-            clean = self.observed(self.nominal, noise=False)
+            clean = self.observed(self.nominal, noise=False, lamp=options.get("lamp"))
             for stage in extra:
                 table[stage] = clean.position(stage)
         data = simulate(truth, self.wavelength, table, flux=flux, seed=seed, **options)

@@ -132,7 +132,7 @@ def test_only_what_data_can_tell_is_a_dependence():
     assert len(steps) == 16
     # one plate angle and one derotator angle are no harmonics, and a short run has no steps
     table = half_wave_plate_cycles(np.zeros(6) * u.deg, [45] * u.deg)
-    assert set(of(data.observed(table=table))) == {"constant", "time", "time2"}
+    assert set(of(data.observed(table=table))) == {"constant", "time", "time2", "brightness"}
     # datasets of one source may differ, and are told by their names
     pair = [data.observed(name="July"), data.observed(seed=2, name="October")]
     both = of(pair)

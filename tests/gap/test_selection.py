@@ -16,7 +16,7 @@ from gap_setups import SETUPS
 from astropolcal import instruments, optics
 from astropolcal.chain import insert_optic
 from astropolcal.gap.attribution import Candidate, Scan
-from astropolcal.gap.cells import Cell
+from astropolcal.gap.cells import Cell, dependences
 from astropolcal.gap.challenge import Setup, make_challenge, score_answer
 from astropolcal.gap.diagnosis import diagnose
 from astropolcal.gap.effects import EFFECTS
@@ -91,6 +91,11 @@ def test_a_background_may_grow_and_one_beam_may_bend():
     setup = SETUPS["charis"]()
     for cell, size, course in (
         ("background/time", 0.01, lambda frames: np.linspace(0, 1, len(frames))),
+        (
+            "background/harmonic:derotator:1",
+            0.01,
+            lambda f: 1 + np.cos(f["derotator"].to_value("rad")),
+        ),
         ("background_of_one_beam/step:20", 0.004, lambda frames: 1.0 * (frames["frame"] >= 20)),
         ("nonlinearity_of_right_beam/flux", 0.004, 1.0),
     ):
@@ -98,6 +103,34 @@ def test_a_background_may_grow_and_one_beam_may_bend():
         (group,) = found.groups
         assert group.probability > 0.9, cell
         assert f"detector/{cell}" in names(group), names(group)
+
+
+@pytest.mark.slow
+def test_a_lamp_whose_polarization_follows_its_flux_is_told_beside_a_background():
+    """To first order both do the same: a lamp of less flux has a larger share of background."""
+    setup = SETUPS["charis"]()
+    how = {"lamp": np.random.default_rng(4).uniform(0.98, 1.02, len(setup.frames)), "seed": 3}
+    lamp, background = "source/depolarization_linear/brightness", "detector/background/flux"
+    follows = setup.with_cell(Cell(*lamp.split("/")), 0.1)
+    for seen in (setup.observed(follows, **how), setup.with_detector("background", 0.05, **how)):
+        (group,) = chosen(setup, seen).groups
+        assert group.probability > 0.9
+        assert {lamp, background} <= set(names(group)), names(group)
+
+
+@pytest.mark.slow
+def test_what_changes_three_times_in_a_turn_of_the_plate_is_in_the_table():
+    """A quarter turn of the plate hardly tells it from two lobes, which were named instead."""
+    setup = SETUPS["charis"]()
+    third = Cell("in:hwp", "rotation", "harmonic:hwp:3")
+    (group,) = chosen(setup, setup.observed(setup.with_cell(third, 0.003, 0.002), seed=3)).groups
+    assert group.probability > 0.9
+    assert third.name in names(group), names(group)
+    assert third.title.endswith("that changes three times in a turn of the half-wave plate")
+    # each angle of the derotator comes once: that is a course in time
+    known = dependences(nominal_model([setup.nominal], [setup.observed()]).problem)
+    assert "harmonic:hwp:3" in known
+    assert "harmonic:derotator:3" not in known
 
 
 @pytest.mark.slow

@@ -118,6 +118,20 @@ def test_observations_are_not_changed():
         assert not np.any(obs.position(name) == 99.0)
 
 
+def test_brightness_is_that_of_the_wavelengths_that_a_frame_has():
+    table, lamp = example_table(), np.array([1.0, 1.1, 0.95, 0.95])
+    spectrum = 1e5 / (1 + np.arange(table["bin"].max() + 1))
+    for beam, share in (("right", 0.7), ("left", 0.3)):
+        table[f"flux_{beam}"] = share * spectrum[table["bin"]] * lamp[table["frame"]] * u.adu
+    found = Observations.from_table(table).position("brightness")
+    np.testing.assert_allclose(found, lamp - 1, atol=1e-12)
+    # without the brightest
+    table["flux_right"][(table["frame"] == 2) & (table["bin"] == 0)] = np.nan
+    with pytest.warns(AstropolcalWarning, match="1 cell masked"):
+        found = Observations.from_table(table).position("brightness")
+    np.testing.assert_allclose(found, lamp - 1, atol=0.02)
+
+
 def test_rate_of_an_angle_is_its_change_from_frame_to_frame():
     for order in [[0, 1, 2, 3], [2, 0, 3, 1]]:
         table = example_table()

@@ -175,7 +175,7 @@ def test_numbers_and_angles_of_stages():
 
 def test_kinds_of_positions_do_not_overlap():
     moves = {f"{stage}{what}" for stage in ("hwp", "derotator") for what in MOVES}
-    others = {"parallactic_rate", "sequence", "flc_state", "frame"}
+    others = {"parallactic_rate", "brightness", "sequence", "flc_state", "frame"}
     assert not set(FLUXES) & (moves | others)
     assert {*FLUXES, *moves, *others} == set(COORDINATES)
     # and the moves of any other stage
