@@ -8,12 +8,12 @@ from astropy.table import QTable
 from scipy import stats
 from scipy.optimize import curve_fit
 
-from astropolcal import Observations, optics
+from astropolcal import Observations, instruments, optics
 from astropolcal.calibration import Calibration, calibrate
 from astropolcal.calibration.noise.weighting import problem_of
 from astropolcal.calibration.uncertainty import standard_errors
 from astropolcal.exceptions import CalibrationFileError, FitError
-from astropolcal.simulation import simulate
+from astropolcal.simulation import half_wave_plate_cycles, simulate
 
 LAM = [1.2, 1.6, 2.2] * u.um
 
@@ -167,3 +167,31 @@ def test_two_errors_from_few_degrees_of_freedom_are_95_percent_of_students_t():
             # five percent are no matter
             times = np.deg2rad(cal.covariance.stds[0]) / plain
             assert times == pytest.approx(max(1, expected / 1.05)), (count, weights)
+
+
+@pytest.mark.slow
+def test_errors_know_of_a_lamp_that_changes_within_pairs():
+    """It flickers and drifts by ten percent; what takes the sum of each frame is free of it."""
+    charis, grid = instruments.get("charis"), np.linspace(1160, 2370, 6) * u.nm
+    sources, moved = ("polarized", "unpolarized"), []
+    chains = [charis.chain(one, derotator="linear", wavelength=grid) for one in sources]
+    for seed in (6, 7):
+        rng = np.random.default_rng(seed)
+        frames = half_wave_plate_cycles(
+            derotator=rng.permutation(np.linspace(45, 132.5, 5)) * u.deg
+        )
+        data = []
+        for i, (chain, source) in enumerate(zip(chains, sources, strict=True)):
+            drift = 0.05 * (-1) ** i * np.linspace(-1, 1, len(frames))
+            light = {"flux": 1e7, "lamp": np.exp(rng.normal(0, 0.005, len(frames)) + drift)}
+            told = {"seed": 10 * seed + i, "name": source, "meta": {"source": source}}
+            data.append(simulate(chain, grid, frames, **light, **told))
+        for observable in ("normalized_double_difference", "per_frame_double_difference"):
+            found = calibrate(chains, data, observable=observable, cross_validate=False)
+            off = abs(found.chains[0]["hwp"].theta.quantity - chains[0]["hwp"].theta.quantity)
+            assert off < 2.5 * found.covariance.std("hwp.theta"), (seed, observable)
+            moved.append(found.fit["lamp_moves"]["errors"])
+            said = any("lamp changes" in words for words in found.verdict().cautions)
+            assert said == (observable == "normalized_double_difference"), (seed, observable)
+    assert min(moved[::2]) > 2
+    assert max(moved[1::2]) < 1e-6
