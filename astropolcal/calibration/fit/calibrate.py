@@ -523,7 +523,8 @@ def _result(fitted, covariance=None):
     if covariance is None:
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
-        own, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own)
+        beside, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own)
+        own = own if white else beside
     stds = own.stds * measurement.free.factors()
     others = fit.pop("others", ()), fitted.lawful
     signs, errors_of_signs = undecided_signs(measurement, view, stds, *others)

@@ -121,12 +121,7 @@ def verdict(calibration, targets=TARGETS):
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
-        lamp = calibration.fit.get("lamp_moves") or {"errors": 0.0}
-        if lamp["errors"] > 1:
-            cautions.append(
-                f"the lamp changes within pairs of frames and moves {lamp['parameter']} by "
-                f"{lamp['errors']:.2g} errors, now in them (observable per_frame_double_difference)"
-            )
+        cautions += _of_lamp(calibration)
         if "restarted" in calibration.settings:
             cautions.append("errors of parameters lack those of what is held")
         cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
@@ -213,6 +208,18 @@ def _carried_off(calibration):
     if not moved["errors"] > _MOVED:
         return ""
     return f"frames at odds move {moved['parameter']} by {moved['errors']:.2g} of its errors"
+
+
+def _of_lamp(calibration):
+    """Name the parameter that changes of the lamp move by more than its other errors."""
+    moved = calibration.fit.get("lamp_moves") or {"errors": 0.0}
+    if not moved["errors"] > 1:
+        return []
+    counted = "not" if calibration.settings["errors"] == "white" else "now"
+    return [
+        f"the lamp changes within pairs of frames and moves {moved['parameter']} by "
+        f"{moved['errors']:.2g} errors, {counted} in them (observable per_frame_double_difference)"
+    ]
 
 
 def _drawn(calibration):
