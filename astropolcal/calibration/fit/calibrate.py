@@ -505,9 +505,8 @@ def describe_gauge(gauge, chosen, free, held):
 
 def _result(fitted, covariance=None):
     """Return the calibration; ``covariance`` is that of more data than its own."""
-    measurement, whitened = fitted.measurement, fitted.whitened
-    settings, fit = fitted.settings, dict(fitted.fit)
-    vector, weighting = measurement.vector(), measurement.weighting
+    measurement, whitened, settings = fitted.measurement, fitted.whitened, fitted.settings
+    vector, weighting, fit = measurement.vector(), measurement.weighting, dict(fitted.fit)
     names, residuals = measurement.free.names, measurement.residuals(vector)
     view = view_of_measurement(measurement, vector, settings["instrument"])
     finding = complete(measurement, whitened, weighting.level, view)
@@ -523,8 +522,7 @@ def _result(fitted, covariance=None):
     if covariance is None:
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
-        beside, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own)
-        own = own if white else beside
+        own, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own, white)
     stds = own.stds * measurement.free.factors()
     others = fit.pop("others", ()), fitted.lawful
     signs, errors_of_signs = undecided_signs(measurement, view, stds, *others)
@@ -599,16 +597,17 @@ def _against_prior(measurement, whitened, covariance):
     return {"parameter": names[own[worst]], "sigma": float(off[worst]), "moves": moved}
 
 
-def _beside_lamp(measurement, whitened, covariance):
+def _beside_lamp(measurement, whitened, covariance, white):
     """Return a covariance that knows of the lamp, and which parameter this moves most.
 
     Where a lamp changes between the frames of a difference, the model has both equally bright.
+    Errors of independent data stay as they are published.
     """
     problem, vector = Problem(measurement, measurement.weighting), measurement.vector()
     rows, priors = problem.jacobian(vector) * whitened.scale, np.zeros(measurement.n_priors)
     pull = np.concatenate([measurement.of_lamp(vector) * problem.weights, priors])
     step, moved = _moved_by(whitened, rows, pull, covariance, measurement)
-    if moved["errors"] > _LITTLE:
+    if moved["errors"] > _LITTLE and not white:
         covariance = covariance.beside(np.where(covariance.stds > 0, step, 0.0)[None])
     return covariance, moved
 
