@@ -19,7 +19,6 @@ import numpy as np
 from astropolcal import optics
 from astropolcal.chain import insert_optic, leaves
 from astropolcal.gap.problem import GapProblem
-from astropolcal.observations.grid import clusters
 from astropolcal.optics.perturbations import GENERATORS, Dependence, split_run
 from astropolcal.optics.positions import COORDINATES
 
@@ -44,7 +43,7 @@ _COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
-_HARMONICS = (1, 2, 4)
+_HARMONICS = (1, 2, 3, 4)
 # steps are looked for at so many frames, and the best of them at those in between
 _MOST_STEPS = 16
 # functions of the frame that differ by less are the same
@@ -289,8 +288,6 @@ def dependences(problem):
     stages = [stage for stage in given if stage not in COORDINATES and stage not in _SKY]
     names = ["constant", "time", "time2"]
     names += [f"harmonic:{stage}:{k}" for stage in stages for k in _HARMONICS]
-    # a stage that takes each angle once has a course in time, and of these there are enough
-    names += [f"harmonic:{stage}:3" for stage in stages if _comes_back(stage, problem)]
     names += [f"state:{stage}" for stage in given if "=" in stage]
     names += [f"{what}:{s}" for s in stages for what in _MOVED]
     # of one beam the sums follow the modulation
@@ -313,14 +310,6 @@ def dependences(problem):
         if name == "constant" or _varies(waves, problem):
             found[name] = waves
     return found
-
-
-def _comes_back(stage, problem):
-    """Return whether a stage takes angles again after others, in each dataset that has it."""
-    angles = [d._given[stage] for d in problem.datasets if stage in d._given]
-    angles = [a.mean(axis=0) if a.ndim == 2 else a for a in angles]
-    numbers = [clusters(angle, turn=2 * np.pi) for angle in angles]
-    return all(np.count_nonzero(np.diff(number)) > number.max() for number in numbers)
 
 
 def _varies(waves, problem):
@@ -386,6 +375,9 @@ class Probes:
     def dependences_of(self, place, kind):
         """Return the dependences of a kind at a place."""
         names = list(self.waves)
+        if kind != "rotation":
+            # nothing but the scale of a stage has reason to change three times in a turn
+            names = [name for name in names if not split_run(name)[0].endswith(":3")]
         if kind in DETECTED or kind in _COURSES:
             allowed = (*_COURSES.get(kind, ()), "dataset")
             names = [name for name in names if split_run(name)[0].partition(":")[0] in allowed]
