@@ -40,8 +40,6 @@ _FIRST_DAMPING, _LEAST_DAMPING, _FREE, _STUCK = 1e-5, 1e-7, 1e-3, 1e3
 # the second derivative along a step is that of this share of it, and what corrects for it is at
 # most so many times as long as the step
 _SHORT, _CURVED = 0.1, 0.75
-# a step that lowers chi-square by this share of what it promises has met a straight model
-_STRAIGHT = 0.9
 # a coefficient closer to its bound than this (canonical units) sits at it
 _AT_BOUND = 1e-9
 # and a value of a law closer than this
@@ -357,50 +355,40 @@ class GapProblem:
         live = np.ones(self.size, dtype=bool) if held is None else ~held
         take = slice(None) if rows is None else rows
         residual, cost = self._cost(q, take)
-        converged, damping, slow, straight = not live.any(), 0.0, False, False
+        converged, damping, slow = not live.any(), 0.0, False
         longest = np.zeros(np.count_nonzero(live))
         for _ in range(steps):
             # from where the model is not defined no step leads down
             if converged or not np.isfinite(cost):
                 break
-            if not straight:
-                slopes, gram, scale = self._normal(q, take, live)
-            if not np.isfinite(gram).all():
+            slopes, *normal = self._normal(q, residual, take, live)
+            if not np.isfinite(normal[0]).all():
                 # the model has no derivative here
                 break
-            pulled = self.tight[live] ** 2 * (self.centre - q)[live]
-            normal = gram, (slopes.T @ residual + pulled) / scale, scale
-            longest, growth = np.maximum(longest, scale), 2
+            longest, growth = np.maximum(longest, normal[-1]), 2
             while damping < _STUCK:
-                damped = damping * (longest / scale) ** 2
+                damped = damping * (longest / normal[-1]) ** 2
                 step, promised = self._step(q, live, *normal, damped)
                 if damping > 0:
                     step = self._bent(q, step, (residual, slopes, take, live), *normal, damped)
                 trial = np.clip(q + step, self.low, self.high)
                 there, new = self._cost(trial, take)
-                better = np.isfinite(new) and new <= cost * (1 + 1e-12)
-                if better or straight:
+                if np.isfinite(new) and new <= cost * (1 + 1e-12):
                     break
                 if damping == 0:
                     # what is short at an extremum, as half a wave is, is long beside it
                     with np.errstate(all="ignore"):
-                        *_, beside = self._normal(q + _SHORT * step, take, live)
+                        *_, beside = self._normal(q + _SHORT * step, residual, take, live)
                     longest = np.maximum(longest, np.where(np.isfinite(beside), beside, 0.0))
                 damping, growth = max(growth * damping, _FIRST_DAMPING), 2 * growth
             else:
                 break
-            if not better:
-                # not so straight
-                straight = False
-                continue
             small = cost - new < max(_ARRIVED, share * new)
             converged, slow = small and (damping < _FREE or slow), small
             # Nielsen's rule: the better the promise was kept, the less the next step is damped
             kept = (cost - new) / promised if promised > 0 else 0.0
             damping *= min(max(1 / 3, 1 - (2 * kept - 1) ** 3), 2.0)
             damping = damping if damping > _LEAST_DAMPING else 0.0
-            # where a step does what was promised, derivatives serve for another one
-            straight = damping == 0 and kept > _STRAIGHT
             q, residual, cost = trial, there, new
         # where no step leads down any more, the bottom is reached as well
         return Fit(q, float(residual @ residual), bool(converged or damping >= _STUCK))
@@ -419,16 +407,17 @@ class GapProblem:
             residual = self.residual(q)[take]
         return residual, residual @ residual + np.sum(((q - self.centre) * self.tight) ** 2)
 
-    def _normal(self, q, take, live):
-        """Return derivatives, their products as columns of unit length, and the lengths."""
+    def _normal(self, q, residual, take, live):
+        """Return derivatives, normal equations of a step in columns of unit length, and lengths."""
         # rows of the transposed table are contiguous
         slopes, tight = self.jacobian(q).T[:, take], self.tight[live]
         slopes = (slopes if live.all() else slopes[live]).T
         gram = slopes.T @ slopes + np.diag(tight**2)
+        target = slopes.T @ residual + tight**2 * (self.centre - q)[live]
         scale = np.sqrt(np.diag(gram))
         # what moves the data by rounding alone has no length
         scale[scale <= np.finfo(float).eps * scale.max(initial=0.0)] = 1.0
-        return slopes, gram / np.outer(scale, scale), scale
+        return slopes, gram / np.outer(scale, scale), target / scale, scale
 
     def _step(self, q, live, gram, target, scale, damped):
         n = len(scale)
