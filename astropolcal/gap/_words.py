@@ -52,11 +52,6 @@ _AMPLITUDES = {
     "move": "change with a move of one radian",
     "brightness": "change where the source is twice as bright",
 }
-# which of them the coefficient of a law is that a parameter follows, by the end of its name
-_OF_LAWS = {
-    **dict.fromkeys(("_c1", "_amplitude", "_amplitude_0"), "amplitude"),
-    "_amplitude_1": "quadrature",
-}
 # what the parameter "right" is of what a detector does, by the kind of its cell: no sum tells a
 # background of one beam from the lamp
 _BEAMS = dict.fromkeys(("nonlinearity", "persistence"), "both beams")
@@ -142,8 +137,8 @@ def labels(entry):
         known = {"amplitude": _AMPLITUDES.get(kind, "size"), "quadrature": "amplitude of the sine"}
         known = {key: words + of for key, words in known.items()}
         known |= {"right": _BEAMS.get(entry["cell"]["kind"])}
-        for end, what in _OF_LAWS.items():
-            known |= {key: known[what] for _, key in keys if key.endswith(end)}
+        # of what follows a course the coefficient of its law is free
+        known |= {key: known["amplitude"] for _, key in keys if key.endswith(("_c1", "_amplitude"))}
     words = [known.get(key) or (key if single else f"{key} of {optic}") for optic, key in keys]
     return [one.replace("_", " ") for one in words]
 

@@ -36,9 +36,9 @@ _DETECTED = {
 }
 #: Kinds that only a detector may have, and the dependence of each.
 DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
-# of these some may also drift, step or follow a stage; an angle may do that, too, and the harmonics
-# of an encoder have names
-_COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step", "harmonic"))
+# of these some may also drift or step; an angle may do that, too, and what follows a stage has a
+# name
+_COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step"))
 _COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))

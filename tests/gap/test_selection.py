@@ -91,11 +91,6 @@ def test_a_background_may_grow_and_one_beam_may_bend():
     setup = SETUPS["charis"]()
     for cell, size, course in (
         ("background/time", 0.01, lambda frames: np.linspace(0, 1, len(frames))),
-        (
-            "background/harmonic:derotator:1",
-            0.01,
-            lambda f: 1 + np.cos(f["derotator"].to_value("rad")),
-        ),
         ("background_of_one_beam/step:20", 0.004, lambda frames: 1.0 * (frames["frame"] >= 20)),
         ("nonlinearity_of_right_beam/flux", 0.004, 1.0),
     ):

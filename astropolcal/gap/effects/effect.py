@@ -751,17 +751,12 @@ def _with_course(optic, key, text):
         # from half a frame before on
         middle = int(parts[0]) - 0.5 + _LONG
         model, free = models.Box1D(amplitude=0, x_0=middle, width=2 * _LONG), "amplitude"
-    elif what == "harmonic":
-        # cosine and sine of an angle in degree
-        rate = int(parts[1]) / 360
-        cosine, sine = (models.Sine1D(0, frequency=rate, phase=x) for x in (0.25, 0.0))
-        model, free = cosine + sine, "amplitude_0 amplitude_1"
     else:
         return optic, (key,)
     optic = optic.copy()
     law, found = law_of(key, getattr(optic, key).unit, model, Dependence(text).driver)
     optic._follow(key, law, found.values())
-    return optic, tuple(f"{key}_{name}" for name in free.split())
+    return optic, (f"{key}_{free}",)
 
 
 class CellEffect(Effect):
@@ -771,12 +766,12 @@ class CellEffect(Effect):
     shows, reference = "what the cell does to the data", "a perturbation of no name"
 
     def __init__(self, cell, degree=2):
-        place, dependence = cell.place, cell.dependence
-        settings = {"words": cell.place, "scale": cell.scale, "limit": cell.limit}
+        place, dependence, settings = cell.place, cell.dependence, {"words": cell.place}
         if cell.kind in DETECTOR:
             optic, free, more = DETECTOR[cell.kind]
+            sizes = {"scale": cell.scale, "limit": cell.limit}
             optic, free = _with_course(optic, free, split_run(dependence)[0])
-            settings |= {"inserted": optic, "free": free} | more
+            settings |= {"inserted": optic, "free": free} | sizes | more
             dependence = "constant" if cell.run is None else f"dataset:{cell.run}"
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))
