@@ -121,11 +121,10 @@ def verdict(calibration, targets=TARGETS):
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
-        cautions += _of_lamp(calibration)
         if "restarted" in calibration.settings:
             cautions.append("errors of parameters lack those of what is held")
         cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
-        cautions += _few(calibration)
+        cautions += [*_few(calibration), *_of_lamp(calibration)]
         # a fit minds the bounds of what leads only
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
@@ -211,13 +210,13 @@ def _carried_off(calibration):
 
 
 def _of_lamp(calibration):
-    """Name the parameter that changes of the lamp move by more than its other errors."""
+    """Name the parameter that the brightness of frames moves by more than its other errors."""
     moved = calibration.fit.get("lamp_moves") or {"errors": 0.0}
     if not moved["errors"] > 1:
         return []
     counted = "not" if calibration.settings["errors"] == "white" else "now"
     return [
-        f"the lamp changes within pairs of frames and moves {moved['parameter']} by "
+        f"frames are not as bright as the model has them, which moves {moved['parameter']} by "
         f"{moved['errors']:.2g} errors, {counted} in them (observable per_frame_double_difference)"
     ]
 
