@@ -395,8 +395,8 @@ _SPOILT = 1e-3
 _SILENT = 1e-12
 # a datum whose fit leaves less than this of what it departs says nothing but of itself
 _ALONE = 1e-6
-# errors by which the lamp may move a parameter without making its errors longer by a tenth
-_LITTLE = 0.45
+# the noise of the sums, which is in the errors, moves no parameter by many more errors than this
+_LITTLE = 1.0
 # a fit is at odds with a prior that is so many of its standard deviations away
 _FAR = 4.0
 
