@@ -16,7 +16,7 @@ __all__ = []
 RANK = 1e-9
 # and so do those below this: a rounding error, as the error would be 1e12 degrees
 _NOTHING = 1e-12
-# products of columns tell directions whose eigenvalues are above this share of the largest
+# products of columns tell a column of which others leave more than this share of its square
 _CLEAR = 1e-5
 # rows of a block of a triangular factorization
 _BLOCK = 4096
