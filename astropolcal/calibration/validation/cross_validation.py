@@ -210,8 +210,6 @@ def _undetermined(problem, out):
 # ---- goodness of fit: whether the residuals exceed the noise ----
 
 
-# weights that differ by less than this share are equal
-_EQUAL = 1e-12
 # fewer degrees of freedom than this give no test
 _LEAST_FREEDOM = 0.5
 # what happens by chance less often than this is no chance
@@ -328,7 +326,7 @@ def _test_of_priors(measurement, vector, hat):
         return None
     chi2 = np.sum(measurement.free.prior_residuals(vector) ** 2)
     rows = np.arange(n, len(hat.basis))
-    mean, dof = _moments(hat, len(rows), hat.products(rows), 0.0)
+    mean, dof = _moments(len(rows), hat.moments(rows), 0.0)
     p = chi2_above(chi2 / mean * dof, dof) if np.isfinite(dof) else np.nan
     return {"chi2": float(chi2), "expected": float(mean), "p_value": float(p)}
 
@@ -337,7 +335,7 @@ def _test_by_wavelength(measurement, vector, noise, hat):
     """Return the table of the test, and mean and freedom of the whole chi-square."""
     numbers, wavelength, rows = data_by_wavelength(measurement)
     residuals, sigma = measurement.residuals(vector), noise.sigma_of_data
-    usable, counted, total = np.isfinite(sigma), 0, 0.0
+    usable, counted = np.isfinite(sigma), np.zeros(0, dtype=int)
     replicates = noise.method == "replicates"
     chi2, mean, dof = np.full((3, len(rows)), np.nan)
     for i, row in enumerate(rows):
@@ -345,9 +343,9 @@ def _test_by_wavelength(measurement, vector, noise, hat):
             # scatter among replicates is noise by definition
             own = noise.dof[i] if replicates else 0.0
             chi2[i] = np.sum((residuals[row] / sigma[row]) ** 2) - own
-            products = 0.0 if hat is None else hat.products(row)
-            mean[i], dof[i] = _moments(hat, row.size, products, own)
-            counted, total = counted + row.size, total + products
+            taken = (0.0, 0.0) if hat is None else hat.moments(row)
+            mean[i], dof[i] = _moments(row.size, taken, own)
+            counted = np.append(counted, row)
     from scipy.special import fdtrc
 
     with np.errstate(invalid="ignore"):
@@ -368,9 +366,9 @@ def _test_by_wavelength(measurement, vector, noise, hat):
         }
     )
     if hat is not None and len(hat.basis) > sigma.size:
-        rest = np.arange(sigma.size, len(hat.basis))
-        counted, total = counted + rest.size, total + hat.products(rest)
-    return table, _moments(hat, counted, total, 0.0)
+        counted = np.append(counted, np.arange(sigma.size, len(hat.basis)))
+    taken = (0.0, 0.0) if hat is None else hat.moments(counted)
+    return table, _moments(counted.size, taken, 0.0)
 
 
 @dataclass
@@ -399,19 +397,15 @@ class _Hat:
         # in units of the noise the hat matrix is a b^T
         return cls(basis, by_noise, (basis * by_noise).T @ (basis * by_noise))
 
-    def products(self, rows):
-        """Return a^T a, a^T b and b^T b of some rows, (3, rank, rank)."""
-        basis, by_noise = self.basis[rows], self.by_noise[rows]
-        if np.ptp(by_noise) <= _EQUAL * by_noise[0]:
-            gram, by = basis.T @ basis, by_noise[0]
-            return np.stack([gram / by**2, gram, gram * by**2])
-        a, b = basis / by_noise, basis * by_noise
-        return np.stack([a.T @ a, a.T @ b, b.T @ b])
-
-    def moments(self, products):
-        """Return tr(Q^T P) and tr((Q^T P)^2) of the products of some rows."""
-        aa, ab, bb = products
+    def moments(self, rows):
+        """Return tr(P Q^T) and tr((P Q^T)^2) of some rows."""
         # P = (a, b) and Q = (a K - b, -a), with K = b^T b of all rows
+        a, b = self.basis[rows] / self.by_noise[rows], self.basis[rows] * self.by_noise[rows]
+        if len(a) < a.shape[1]:
+            left = a @ self.inner @ a.T - a @ b.T - b @ a.T
+            return np.trace(left), np.sum(left**2)
+        # of Q^T P, which is the smaller one
+        aa, ab, bb = a.T @ a, a.T @ b, b.T @ b
         first, second = self.inner @ aa - ab.T, self.inner @ ab - bb
         square = np.sum(first * first.T) - 2 * np.sum(second * aa.T) + np.sum(ab * ab.T)
         return np.trace(first) - np.trace(ab), square
@@ -424,10 +418,10 @@ def chi2_above(chi2, dof):
     return gammaincc(dof / 2, np.maximum(chi2, 0) / 2)
 
 
-def _moments(hat, n, products, own):
+def _moments(n, taken, own):
     """Return mean and effective freedom of chi-square without the replicates' own."""
-    # tr(C) and tr(C^2) of C = 1 + P Q^T from small matrices, not the n x n one
-    once, twice = (0.0, 0.0) if hat is None else hat.moments(products)
+    # tr(C) and tr(C^2) of C = 1 + P Q^T
+    once, twice = taken
     mean = n + once - own
     square = n + 2 * once + twice - own
     if mean <= _LEAST_FREEDOM or square <= 0:
