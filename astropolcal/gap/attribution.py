@@ -396,11 +396,10 @@ def _named(probes, effects, temper, degree="default", others=()):
 
     fitting, others = ([*filter(fits, some)] for some in (effects, others))
     law = replace(model.context, degree=degree)
-    for effect in fitting:
-        spectrum = _bent_name(probes, effect, law) if effect.name not in model.added else None
-        if spectrum is None:
-            slopes = _slopes_of(probes, effect, [*fitting, *others], degree)
-            spectrum = _spectrum_of(probes, slopes)
+    slopes = [_slopes_of(probes, effect, [*fitting, *others], degree) for effect in fitting]
+    for effect, spectrum in zip(fitting, _spectra_of(probes, slopes), strict=True):
+        bent = _bent_name(probes, effect, law) if effect.name not in model.added else None
+        spectrum = spectrum if bent is None else bent
         if spectrum is not None:
             context = None if degree == "default" else law
             found.append(_with_name(effect, model, *spectrum, temper, context))
@@ -446,7 +445,7 @@ def _named_in(probes, effect, i, temper, context):
     rows = probes.problem.segments[i]
     alone = np.zeros_like(slopes)
     alone[rows] = slopes[rows]
-    spectrum = _spectrum_of(probes, alone)
+    (spectrum,) = _spectra_of(probes, [alone])
     return [] if spectrum is None else [_with_name(effect, probes.model, *spectrum, temper)]
 
 
@@ -458,15 +457,21 @@ def _slopes_of(probes, effect, effects, degree):
     return _columns(model, effects, degree).get(effect.name)
 
 
-def _spectrum_of(probes, slopes):
-    """Return what derivatives say of an effect, see `_spectra`, None where it does nothing."""
+def _spectra_of(probes, tables):
+    """Return what derivatives say of effects, see `_spectra`, None of those that do nothing."""
     # a law may have no freedom left
-    if slopes is None or not slopes.size:
-        return None
-    seen = probes.tangent.T @ slopes
-    gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
-    values, share = (part[0] for part in _spectra(gram[None], target[None]))
-    return (values, share) if _rank(values, 1.0) else None
+    known = [slopes for slopes in tables if slopes is not None and slopes.size]
+    taken = probes.tangent.T @ np.concatenate([probes.tangent[:, :0], *known], axis=1)
+    parts, found = iter(np.split(taken, np.cumsum([t.shape[1] for t in known]), axis=1)), []
+    for slopes in tables:
+        if slopes is None or not slopes.size:
+            found.append(None)
+            continue
+        seen = next(parts)
+        gram, target = slopes.T @ slopes - seen.T @ seen, slopes.T @ probes.residual
+        values, share = (part[0] for part in _spectra(gram[None], target[None]))
+        found.append((values, share) if _rank(values, 1.0) else None)
+    return found
 
 
 def _columns_of(problem, jacobian, parameters):

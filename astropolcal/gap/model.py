@@ -298,6 +298,11 @@ class Model:
         return self.problem.jacobian(self.fit.coefficients)
 
     @cached_property
+    def decomposed(self):
+        """What data and priors determine of the coefficients, as `GapProblem.decomposed`."""
+        return self.problem.decomposed(self.fit.coefficients, self.jacobian)
+
+    @cached_property
     def _spectra(self):
         """Return what the data say of each effect at the fit, by name, for `costs`.
 

@@ -511,7 +511,7 @@ class Forecast:
         """Return what the data determine, as few rows, and the directions that they do not."""
         if not self.problem.size:
             return (np.empty((0, 0)),) * 4
-        singular, right, scale = self.model.problem.decomposed(self.model.fit.coefficients)
+        singular, right, scale = self.model.decomposed
         is_open = singular < OPEN * singular[0]
         return singular[:, None] * right, right[~is_open].T, right[is_open].T, scale
 

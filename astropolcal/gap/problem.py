@@ -14,8 +14,9 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, null_space, solve_triangular
 from scipy.optimize import lsq_linear, nnls
 
+from astropolcal.calibration.identifiability.linearized import orthonormal, triangle
 from astropolcal.chain import Train, leaves
-from astropolcal.gap.channels import Channels, expected_fluxes, noise, orthonormal, settings
+from astropolcal.gap.channels import Channels, expected_fluxes, noise, settings
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import _positions as _read_positions
 from astropolcal.measurement.parameters import bind_prior
@@ -183,7 +184,7 @@ class GapProblem:
             blocks.append(block)
             # what a law cannot describe of the value about which it is stays as it is
             around = absent[slot.slice] * follows
-            rest.append(around - block @ np.linalg.lstsq(block, around, rcond=None)[0])
+            rest.append(around - block @ _along(block, around))
             k = block.shape[1]
             self.slices[slot.name] = slice(start, start + k)
             self.names += [slot.name if k == 1 else f"{slot.name}[{i}]" for i in range(k)]
@@ -223,11 +224,8 @@ class GapProblem:
     def coefficients(self, vector):
         """Return the coefficients whose laws are nearest to canonical values, see `vector`."""
         vector = vector - self._rest
-        parts = [
-            np.linalg.lstsq(block, vector[slot.slice], rcond=None)[0]
-            for slot, block in zip(self.free.slots, self._blocks, strict=True)
-        ]
-        return np.concatenate(parts) if parts else np.empty(0)
+        blocks = zip(self.free.slots, self._blocks, strict=True)
+        return np.concatenate([vector[:0], *(_along(b, vector[slot.slice]) for slot, b in blocks)])
 
     def vector(self, coefficients):
         """Return the canonical values of the free parameters, shape (n_free,)."""
@@ -484,25 +482,26 @@ class GapProblem:
         known = int(np.count_nonzero(self._holds.any(axis=1)))
         return known + sum(channel.n_data for channel in self.channels)
 
-    def decomposed(self, coefficients):
+    def decomposed(self, coefficients, jacobian=None):
         """
         Return what data and priors determine: singular values, directions, and scale.
 
         Of the derivatives with columns of unit length; rows of the second are directions
         in these columns, the third is the length that the columns had.
         """
-        table = np.concatenate([self.jacobian(coefficients), np.diag(self.tight)])
+        jacobian = self.jacobian(coefficients) if jacobian is None else jacobian
+        table = np.concatenate([jacobian, np.diag(self.tight)])
         scale = np.linalg.norm(table, axis=0)
         scale = np.where(scale > 0, scale, 1.0)
-        _, singular, right = np.linalg.svd(table / scale, full_matrices=False)
+        _, singular, right = np.linalg.svd(triangle(table / scale), full_matrices=False)
         return singular, right, scale
 
-    def directions(self, coefficients):
-        """Return a root of the covariance, (k, size), and the directions that are open."""
-        singular, right, scale = self.decomposed(coefficients)
-        good = singular > OPEN * singular[0]
-        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
-        return right[good] / singular[good, None] / scale, right[~good]
+
+def _along(block, values):
+    """Return the coefficients of a law nearest to values, themselves where each is free."""
+    if len(block) == block.shape[1]:
+        return values
+    return np.linalg.lstsq(block, values, rcond=None)[0]
 
 
 def _within(triangle, wanted, low, high, found):

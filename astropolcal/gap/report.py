@@ -112,9 +112,9 @@ def _worked_out(diagnosis):
     exchanged = any(cause.effect.kind == "discrete" for cause in diagnosis.causes)
     misread = any(getattr(cause.effect, "is_of_table", False) for cause in diagnosis.causes)
     same = improved is nominal
-    before = accuracies(nominal, crossed and not exchanged)
-    after = before if same else accuracies(improved, crossed)
     fitted = Fitted(improved)
+    before = accuracies(fitted if same else Fitted(nominal), crossed and not exchanged)
+    after = before if same else accuracies(fitted, crossed)
     causes = [_cause(diagnosis, i, fitted) for i in range(len(diagnosis.causes))]
     ranks = {cause["name"]: cause["rank"] for cause in causes}
     for cause in causes:
@@ -453,7 +453,10 @@ class Fitted:
     @cached_property
     def _directions(self):
         """Root of the covariance for unit noise, and directions that data do not determine."""
-        return self.problem.directions(self.model.fit.coefficients)
+        singular, right, scale = self.model.decomposed
+        good = singular > OPEN * singular[0]
+        # covariance = (J^T J)^-1 = V S^-2 V^T, without the open directions
+        return right[good] / singular[good, None] / scale, right[~good]
 
     @cached_property
     def covariance(self):
@@ -478,14 +481,15 @@ def _number(values):
 # ---- accuracies -----------------------------------------------------------------------------
 
 
-def accuracies(model, cross_validate=True):
+def accuracies(fitted, cross_validate=True):
     """
-    Return what `calibrate` says of a model, with the sizes of its causes as found, ready for JSON.
+    Return what `calibrate` says of a fitted model, with its causes as found, ready for JSON.
 
     ``rms_percent`` is the root mean square of the double differences over all data: of left-out
     frames that others foresee, or of the fit where there is no cross-validation. Where such a
     calibration is not possible it is None, and the lists are empty.
     """
+    model = fitted.model
     instrument = next((o.instrument for o in model.observations if o.instrument), None)
     found = {
         "observable": default_observable(model.observations),
@@ -500,7 +504,7 @@ def accuracies(model, cross_validate=True):
             made = model.calibration or _with_causes_held(model, instrument)
             tables = made.accuracies(cross_validate=cross_validate)
             # what is not known of the causes is not known on sky
-            seen = with_causes(model, instrument) if model.added else made.calibration()
+            seen = with_causes(fitted, instrument) if model.added else made.calibration()
             targets = target_accuracies(seen)
             if not all(np.isfinite(table["s_p"]).all() for table in targets):
                 targets = target_accuracies(seen, open_directions="ignore")
@@ -547,23 +551,24 @@ def _with_causes_held(model, instrument):
     return fit_measurement(measurement, **how)
 
 
-def with_causes(model, instrument=None):
-    """Return a model as a calibration, with the errors that its fit of single differences leaves.
+def with_causes(fitted, instrument=None):
+    """Return a fitted model as a calibration, with the errors of its fit of single differences.
 
     Where these do not tell all of a cause, its components are no larger than is usual, or than the
     largest of them. What is not known of the causes is not known of the other parameters, and on
     sky, either.
     """
+    model = fitted.model
     if not model.added:
         made = model.calibration or _with_causes_held(model, instrument)
         told = {"instrument": instrument or made.settings["instrument"]}
         return replace(made, settings=made.settings | told).calibration()
-    found, chains = Fitted(model), [chain.copy() for chain in model.chains]
+    chains = [chain.copy() for chain in model.chains]
     causes = {p.name: p for own in model.added.values() for p in own}
     for name, parameter in causes.items():
         slot = model.problem.free.by_name[name]
         optic, key = name.split(".")
-        value, std, _ = (one / slot.factor for one in found.values(parameter))
+        value, std, _ = (one / slot.factor for one in fitted.values(parameter))
         # errors of all wavelengths may be one and the same, which priors of each do not know
         std = np.where(std > 0, std * np.sqrt(std.size), parameter.canonical_limit / slot.factor)
         for leaf in (leaf for chain in chains for leaf in leaves(chain) if leaf.name == optic):
@@ -574,16 +579,16 @@ def with_causes(model, instrument=None):
     settings = {"strategy": "diagnosis", "fitter": "diagnose", "gauge": "none"}
     told = {"converged": model.fit.converged, "message": "single differences of all frames"}
     standing = standing_at(measurement, told, tuple(causes), instrument=instrument, **settings)
-    return standing.calibration(covariance=_covariance(model, measurement.free))
+    return standing.calibration(covariance=_covariance(fitted, measurement.free))
 
 
-def _covariance(model, free):
+def _covariance(fitted, free):
     """Return the covariance of the parameters of a model with causes."""
-    problem = model.problem
-    singular, right, scale = problem.decomposed(model.fit.coefficients)
+    model, problem = fitted.model, fitted.problem
+    singular, right, scale = model.decomposed
     known, each = singular > OPEN * singular[0], problem.spread(right / scale)
     sizes = np.sqrt(max(1.0, model.mean_square)) / singular[known, None]
-    half = np.concatenate([sizes * each[known], Fitted(model).bends])
+    half = np.concatenate([sizes * each[known], fitted.bends])
     return covariance_along(free, half / free.steps, each[~known] / free.steps)
 
 

@@ -199,7 +199,7 @@ def _record(calibration, path, file, dataset):
 
 def _write(diagnosis, content, arguments, instrument):
     """Write what was asked for."""
-    from astropolcal.gap.report import with_causes, write_html
+    from astropolcal.gap.report import Fitted, with_causes, write_html
 
     if arguments.json:
         common.write_json(content, arguments.json)
@@ -209,7 +209,7 @@ def _write(diagnosis, content, arguments, instrument):
         figures["size_figures"] = _size_figures(diagnosis, content)
         write_html(diagnosis, arguments.report, **figures)
     if arguments.save and not content["misread"]:
-        calibration = with_causes(diagnosis.improved, instrument=instrument)
+        calibration = with_causes(Fitted(diagnosis.improved), instrument=instrument)
         calibration.write(arguments.save, overwrite=True)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from astropolcal import instruments
 from astropolcal.gap.effects import Context, get_effect
 from astropolcal.gap.model import Model
-from astropolcal.gap.problem import TOUCHES, GapProblem
+from astropolcal.gap.problem import OPEN, TOUCHES, GapProblem
 from astropolcal.observations import Observations
 from astropolcal.simulation import half_wave_plate_cycles, simulate
 
@@ -68,7 +68,9 @@ def clean_model(seed=1):
 
 def errors(problem, coefficients):
     """Return the standard errors of the coefficients, infinite where they are open."""
-    half, null = problem.directions(coefficients)
+    singular, right, scale = problem.decomposed(coefficients)
+    good = singular > OPEN * singular[0]
+    half, null = right[good] / singular[good, None] / scale, right[~good]
     is_open = np.sum(null**2, axis=0) > TOUCHES**2
     prior = np.divide(1, problem.tight, out=np.full(problem.size, np.inf), where=problem.tight > 0)
     return np.minimum(np.where(is_open, np.inf, np.linalg.norm(half, axis=0)), prior)

@@ -21,7 +21,7 @@ from astropolcal.exceptions import AstropolcalWarning, GapError
 from astropolcal.gap import EFFECTS, Effect, diagnose, model, problem
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.model import thinned
-from astropolcal.gap.report import to_dict, with_causes
+from astropolcal.gap.report import Fitted, to_dict, with_causes
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.measurement import Measurement
 from astropolcal.observations import Observations
@@ -323,7 +323,7 @@ def test_what_was_found_and_saved_may_have_changed_again():
         seen = data.with_flux(data.observed(seed=night), np.full(32, gain))
         diagnosis = diagnose(nominal, seen, **options, cross_validate=False)
         assert [cause.name for cause in diagnosis.causes] == ["beam_gain"]
-        nominal = with_causes(diagnosis.improved)
+        nominal = with_causes(Fitted(diagnosis.improved))
         gains = [o.imbalance.value for o in leaves(nominal.chains[0]) if "beam_gain" in o.name]
         assert len(gains) == night
         assert np.allclose(sum(gains), (gain - 1) / (gain + 1), atol=1e-3)

@@ -185,7 +185,7 @@ def test_frames_that_no_other_foresees_do_not_make_the_gap_smaller():
     known = np.isfinite(table["s_cv"].value)
     gap = np.sqrt(np.average(table["s_cv"].value[known] ** 2, weights=table["n"][known]))
     assert not known.all()
-    assert accuracies(model)["rms_percent"] == pytest.approx(gap, rel=1e-3)
+    assert accuracies(Fitted(model))["rms_percent"] == pytest.approx(gap, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -456,9 +456,10 @@ def test_what_takes_a_parameter_off_its_prior_may_be_what_the_model_lacks():
 
 
 def test_an_improved_model_is_a_calibration_with_the_sizes_and_errors_of_the_report(found, nothing):
-    seen, report = with_causes(found.improved, "charis"), Fitted(found.improved)
+    report = Fitted(found.improved)
+    seen, same = (with_causes(one, "charis") for one in (report, Fitted(nothing.improved)))
     # of the instrument that is asked for, with and without causes
-    assert [seen.instrument, with_causes(nothing.improved, "charis").instrument] == ["charis"] * 2
+    assert [seen.instrument, same.instrument] == ["charis"] * 2
     (cause,) = found.causes
     for name, size in report.sizes(cause.name).items():
         optic, key = name.split(".")
