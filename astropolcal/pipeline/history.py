@@ -8,19 +8,15 @@ Calibrations that share data are refused, because their errors are not independe
 what changed since a calibration, and holds the rest; as the errors of the rest are not in its own,
 there is a warning where it is compared.
 
-For the course of an optic through many calibrations, each says what it knows of the optic by its
-values and its information, the inverse of its covariance in the directions that all determine. Five
-courses are compared by their evidence:
-constant; steps between runs (a partition of the runs into stretches of one value each, Barry &
-Hartigan 1993, doi:10.1080/01621459.1993.10594323); a drift in proportion to the date; a random
-walk; and a scatter from run to run. A deviation from the common value follows a law in wavelength,
-of one, or three numbers per parameter, or is free. Its size is unknown within three orders of
-magnitude and averaged over, in units of the error of one run (Zellner's g-prior).
+For the courses of optics through many calibrations, each is a few rows, its values weighted by its
+information, the inverse of its covariance in the directions that all determine. Rows of all are put
+together, as `calibrate_runs` does with those of tables, and its search for what varies is the same.
 """
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -28,14 +24,7 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 
 from astropolcal.calibration.fit.calibrate import calibrate
-from astropolcal.calibration.fit.evidence import (
-    COURSES,
-    LAWS,
-    SIZES,
-    chances_of,
-    law_of,
-    log_evidence,
-)
+from astropolcal.calibration.fit.run_model import Model
 from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.calibration.system import free_of
 from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
@@ -60,10 +49,6 @@ _SHORT, _TURNED = 1e-5, 0.3
 _PERIODS = {"retardance": 360.0, "theta": 180.0}
 # of a history
 _COLUMNS = ("date", "calibration", "parameter", "wavelength", "value", "std", "unit", "fixed")
-# prior of a partition into stretches, of which most are one; the others share the rest
-_PARTITION = 0.7
-# a change between two runs is thought this probable beforehand
-_CHANGE = 0.05
 
 
 def named_by_date(calibrations):
@@ -422,7 +407,11 @@ def _in_one_gauge(opens, size):
 
 def changes(calibrations, parameters=None):
     """
-    Return what changed from each calibration to the next, optic by optic.
+    Return what changed from each calibration to the next.
+
+    All optics together, and each by itself, where all others may have changed as well. A change
+    that only a combination of optics shows, such as that of the zeros of two stages, is in the
+    first row alone; `courses` finds the optic that explains it.
 
     Parameters
     ----------
@@ -435,8 +424,8 @@ def changes(calibrations, parameters=None):
     Returns
     -------
     `~astropy.table.Table`
-        One row per pair and optic: ``before``, ``after``, ``what``, ``chi2``, ``dof``, ``p_value``,
-        ``sigma``, ``n_open``, ``left_out``.
+        One row per pair and optic, before them one of ``"all"``: ``before``, ``after``, ``what``,
+        ``chi2``, ``dof``, ``p_value``, ``sigma``, ``n_open``, ``left_out``.
 
     Raises
     ------
@@ -451,14 +440,14 @@ def changes(calibrations, parameters=None):
     >>> from astropolcal.testing import example_calibration
     >>> years = [example_calibration(seed=i) for i in (5, 6)]
     >>> changes(years)["what"].tolist()
-    ['calibration_polarizer', 'hwp', 'derotator', 'wollaston']
+    ['all', 'calibration_polarizer', 'hwp', 'derotator', 'wollaston']
     """
     named = named_by_date(calibrations)
     numbers = ("chi2", "dof", "p_value", "sigma", "n_open")
     rows = []
     for pair in pairwise(named):
-        for what in parameters or optics_of(pair):
-            found = significance(pair, [what])
+        for what in parameters or ["all", *optics_of(pair)]:
+            found = significance(pair, None if what == "all" else [what])
             row = {"before": pair[0][0], "after": pair[1][0], "what": what}
             row |= {key: getattr(found, key) for key in numbers}
             rows.append(row | {"left_out": len(found.left_out)})
@@ -481,13 +470,17 @@ def courses(calibrations, parameters=None, *, events=()):
     """
     Return what each optic did through a series of calibrations, and when it changed.
 
+    All optics are judged together, by the fewest that explain how the calibrations differ: what one
+    lamp alone may not tell apart, such as the zeros of two stages, is well known in combination. An
+    optic that is given counts as constant beside what others do.
+
     Parameters
     ----------
     calibrations : Library or sequence
         See `parameter_history`; at least three, each with a date of its own and data of its own.
     parameters : sequence of str, optional
-        Optics or parameters that are judged one by one; by default all optics that are free in
-        all calibrations.
+        Optics or parameters that are judged, where all others may have changed as well; by
+        default all optics that are free in all calibrations.
     events : sequence of str or `~astropy.time.Time`
         Dates at which something was done to the instrument: a change there is as probable
         beforehand as none.
@@ -495,11 +488,13 @@ def courses(calibrations, parameters=None, *, events=()):
     Returns
     -------
     `~astropy.table.Table`
-        One row per optic: ``what``; ``course``, the most probable of constant, steps, drift, walk
-        and scatter; the probability of each; ``change``, the probability of a step between each
-        calibration and the next (n - 1 numbers); ``n_open``, the directions that one of the
-        calibrations does not determine; they take no part.
-        ``meta["calibrations"]`` and ``meta["dates"]`` name the runs.
+        As ``courses`` of `~astropolcal.calibration.RunsCalibration`, one row per optic, or per
+        parameter that alone varies: ``what``; its ``course``; the ``probability`` that this is
+        what varies, or that it is constant; that of each course, beside all others; ``when``,
+        between which calibrations it changed (95 %); ``or``, what would explain them nearly as well
+        in its place. ``meta["calibrations"]`` and ``meta["dates"]`` name the runs,
+        ``meta["steps"]`` those before and after each step, row by row, and ``meta["n_open"]`` is
+        the number of directions that one of the calibrations does not determine; they take no part.
 
     Raises
     ------
@@ -525,9 +520,9 @@ def courses(calibrations, parameters=None, *, events=()):
     ...     table = simulate(truth, charis.wavelength, frames, seed=i,
     ...                      meta={"date": f"202{i + 5}-03-01"})
     ...     years.append(calibrate(chain, table, cross_validate=False))
-    >>> found = courses(years, ["hwp"])
-    >>> str(found["course"][0]), found["change"][0].round(2).tolist()
-    ('steps', [0.0, 1.0, 0.0])
+    >>> (found,) = courses(years, ["hwp.theta"])
+    >>> str(found["course"]), str(found["when"])
+    ('steps', '2026-03-01 to 2027-03-01')
     """
     named = named_by_date(calibrations)
     if len(named) < 3:
@@ -541,108 +536,44 @@ def courses(calibrations, parameters=None, *, events=()):
                 f"{named[i - 1][0]} and {name} are both of {date}: neither comes first"
             )
     dates = Time(told, scale="tai")
-    priors = chances_of(dates, events, _CHANGE)
-    rows = []
     _check_independent(named)
-    for what in parameters or optics_of(named):
-        found = compared(named, [what])
-        if not found.slopes.size:
-            # nothing of it is determined
-            continue
-        evidence, change = _weighed(found, dates.mjd, priors)
-        chance = np.exp(evidence - np.logaddexp.reduce(evidence))
-        row = {"what": what, "course": COURSES[int(np.argmax(chance))]}
-        row |= dict(zip(COURSES, chance, strict=True))
-        rows.append(row | {"change": change, "n_open": found.n_open})
-    table = Table(rows=rows)
-    table.meta |= {"calibrations": [name for name, _ in named], "dates": dates.isot.tolist()}
+    found, rows, spans = compared(named, parameters), [], []
+    if found.slopes.size:
+        # something is determined in all of them
+        model = Model(_Standing(found, named[0][1]), (), dates, events)
+        model.search()
+        rows, spans = model.courses()
+    table, names = Table(rows=rows), [name for name, _ in named]
+    table.meta |= {"calibrations": names, "dates": dates.isot.tolist(), "n_open": found.n_open}
+    table.meta["steps"] = [[(names[a], names[b + 1]) for a, b in own] for own in spans]
     return table
 
 
-def _weighed(found, mjd, priors):
-    """Return the log evidence of each course, and the probability of a change in each gap."""
-    laws = []
-    for count in LAWS:
-        # orthonormal, and without what the directions do not know
-        left, size, _ = np.linalg.svd(
-            found.slopes @ law_of(found.names, count), full_matrices=False
+class _Standing:
+    """Calibrations as runs of which the rows stay, in what all of them determine."""
+
+    def __init__(self, found, first):
+        units = dict(zip(first.covariance.names, first.covariance.units, strict=True))
+        steps = np.array([declared_step(units[name]) for name in found.names])
+        size, count = len(found.names), len(found.weights)
+        free = SimpleNamespace(
+            names=found.names,
+            steps=np.ones(size),
+            bounds=lambda: (np.full(size, -np.inf), np.full(size, np.inf)),
+            prior_jacobian=lambda vector: np.empty((size, 0)),
+            prior_residuals=lambda vector: np.empty(0),
         )
-        laws.append(left[:, size > 1e-6 * size.max(initial=1e-300)])
-    # a law that spans the same as one before is the same
-    laws = {law.shape[1]: law for law in reversed(laws) if law.shape[1]}.values()
-    # date from -1 to 1
-    time = 2 * (mjd - mjd[0]) / np.ptp(mjd) - 1
-    line = np.stack([np.ones(len(mjd)), time], axis=1)
-    parts, changes = [], []
-    for law in laws:
-        gram = law.T @ found.weights @ law
-        target = np.einsum("ik,nij,nj->nk", law, found.weights, found.deviations)
-        # unit information of one run: the g-prior then is a multiple of unity
-        root = np.linalg.inv(np.linalg.cholesky(gram.mean(axis=0)))
-        gram, target = root @ gram @ root.T, target @ root.T
-        k = law.shape[1]
-        # deviations in proportion to functions of the run
-        both = np.einsum("na,nb,nij->aibj", line, line, gram).reshape(2 * k, 2 * k)
-        along = np.einsum("na,ni->ai", line, target).ravel()
-        for size in SIZES:
-            one, change = _partitions(gram, target, size, priors)
-            scatter = log_evidence(gram, target, size).sum()
-            walk = _walk(gram, target, size, mjd)
-            parts.append([*one, log_evidence(both, along, size), walk, scatter])
-            changes.append(change)
-    parts, n = np.array(parts), len(parts)
-    share = np.log([_PARTITION, _PARTITION, *[(1 - _PARTITION) / 3] * 3])
-    evidence = np.logaddexp.reduce(parts, axis=0) - np.log(n) + share
-    # a step is a step only as far as neither a drift nor a walk explains it
-    weight = np.exp(parts[:, 1] - np.log(n) + share[1] - np.logaddexp.reduce(evidence))
-    return evidence, np.asarray(changes).T @ weight
+        self.shapes, self.alone = [SimpleNamespace(free=free)] * count, [np.zeros(size)] * count
+        roots = np.swapaxes(np.linalg.cholesky(found.weights), 1, 2)
+        seen = zip(roots, found.deviations, strict=True)
+        self.rows = [
+            SimpleNamespace(rows=root @ found.slopes * steps, targets=root @ off, chi2=0.0)
+            for root, off in seen
+        ]
 
-
-def _partitions(gram, target, size, priors):
-    """Return the log evidence of one stretch, and of more, and the chance of a change in each gap.
-
-    By dynamic programming over the ends of stretches; the chance is that among partitions of
-    more than one stretch.
-    """
-    n = len(gram)
-    grams, targets = (np.concatenate([0 * x[:1], np.cumsum(x, axis=0)]) for x in (gram, target))
-    change, stay = np.log(priors), np.log1p(-priors)
-    quiet = np.concatenate([[0.0], np.cumsum(stay)])
-    stretch = np.full((n + 1, n + 1), -np.inf)
-    for i in range(n):
-        for j in range(i + 1, n + 1):
-            own = log_evidence(grams[j] - grams[i], targets[j] - targets[i], size)
-            # within a stretch no gap changes
-            stretch[i, j] = own + quiet[j - 1] - quiet[i]
-    # at the first and the last run a stretch begins and ends for certain
-    change = np.concatenate([[0.0], change, [0.0]])
-    ahead, behind = np.full(n + 1, -np.inf), np.full(n + 1, -np.inf)
-    ahead[0] = behind[n] = 0.0
-    for j in range(1, n + 1):
-        ahead[j] = np.logaddexp.reduce(ahead[:j] + change[:j] + stretch[:j, j])
-    for i in range(n - 1, -1, -1):
-        behind[i] = np.logaddexp.reduce(behind[i + 1 :] + change[i + 1 :] + stretch[i, i + 1 :])
-    one = stretch[0, n]
-    more = ahead[n] + np.log1p(-min(np.exp(one - ahead[n]), 1 - 1e-15))
-    chance = np.exp(ahead[1:n] + behind[1:n] + change[1:n] - more)
-    return (one, more), np.clip(chance, 0.0, 1.0)
-
-
-def _walk(gram, target, size, mjd):
-    """Return the log evidence of a random walk, which begins anywhere."""
-    unit = np.eye(gram.shape[1])
-    mean, spread, total = np.zeros(len(unit)), size**2 * unit, 0.0
-    # the walk reaches the size over the whole series, in proportion to time
-    paces = size**2 * np.diff(mjd, prepend=mjd[0]) * (1 - 1 / len(mjd)) / np.ptp(mjd)
-    for own, aim, pace in zip(gram, target, paces, strict=True):
-        spread = spread + pace * unit
-        # aim is W (x - middle); about the mean that is foreseen
-        surprise = aim - own @ mean
-        gain = np.linalg.inv(unit + spread @ own) @ spread
-        total += 0.5 * surprise @ gain @ surprise + mean @ aim - 0.5 * mean @ own @ mean
-        total -= 0.5 * np.linalg.slogdet(unit + spread @ own)[1]
-        mean, spread = mean + gain @ surprise, gain
-    return total
+    def around(self, vectors):
+        """Return the rows of all calibrations."""
+        return self.rows
 
 
 # ---- refit what changed since a calibration, and hold the rest ----

@@ -2,7 +2,6 @@
 """The health of an instrument through all its calibrations: what changed, and what needs care."""
 
 import warnings
-from itertools import pairwise
 
 import astropy.units as u
 import numpy as np
@@ -57,10 +56,10 @@ def health(library, *, goal=None, max_age=None, events=(), now=None):
     dict
         Ready for JSON: ``now``, ``unreadable`` and ``groups``, one per instrument and mode, with
         ``instrument``, ``mode``, ``calibrations`` (name, date, ``s_res_percent``,
-        ``s_cv_percent``, converged, datasets), ``courses`` (what, course, probabilities),
-        ``events`` (what, between which calibrations and dates, probability), ``alarms`` and
-        ``next`` (sentences), and ``left_out``, why calibrations take no part in the courses; those
-        that are dated after ``now`` are not there.
+        ``s_cv_percent``, converged, datasets), ``courses`` (what, or what else, course,
+        probabilities), ``events`` (what, between which calibrations and dates, probability),
+        ``alarms`` and ``next`` (sentences), and ``left_out``, why calibrations take no part in the
+        courses; those that are dated after ``now`` are not there.
 
     Raises
     ------
@@ -149,18 +148,18 @@ def _group(entries, rows, moment, goal, limit, events):
             found = ()
             few = f"{counted(len(dated), 'calibration')} with a date; courses need at least three"
             left_out.append(few if len(dated) < 3 else str(problem))
-    for row in found:
+    for row, steps in zip(found, found.meta["steps"] if len(found) else (), strict=True):
         what, course = row["what"], row["course"]
-        words = f"{what} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
-        one = {"what": what, "course": course} | {name: row[name] for name in COURSES}
-        content["courses"].append(one | {"words": words})
-        for (before, after), chance in zip(pairwise(dated), row["change"], strict=True):
-            if chance >= LIKELY:
-                days = [_start(e)[:10] for e in (before, after)]
-                words = f"{what} changed between {days[0]} and {days[1]} ({100 * chance:.0f} %)"
-                one = {"what": what, "before": before.name, "after": after.name, "from": days[0]}
-                one |= {"to": days[1], "probability": chance, "words": words}
-                content["events"].append(one)
+        rivals = [one for one in row["or"].split(", ") if one]
+        known = {"what": what, "or": rivals, "course": course}
+        told, surely = listed([what, *rivals], "or"), 1 - row["constant"]
+        words = f"{told} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
+        content["courses"].append(known | {name: row[name] for name in COURSES} | {"words": words})
+        for before, after in steps if surely >= LIKELY else ():
+            days = [_start(e)[:10] for e in dated if e.name in (before, after)]
+            words = f"{told} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
+            one = {"what": told, "before": before, "after": after, "from": days[0], "to": days[1]}
+            content["events"].append(one | {"probability": surely, "words": words})
     content["events"].sort(key=lambda one: one["to"])
     known = known_instrument(newest.calibration.instrument) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
@@ -212,9 +211,9 @@ def _alarms(content, newest, verdict, moment, goal, limit):
             "calibrations have no calibration that is sure."
         )
     moving = [
-        one["what"]
+        listed([one["what"], *one["or"]], "or")
         for one in content["courses"]
-        if one["course"] in ("drift", "walk", "scatter") and one[one["course"]] >= LIKELY
+        if one["course"] not in ("constant", "steps") and one["constant"] <= 1 - LIKELY
     ]
     if moving:
         verb = "is" if len(moving) == 1 else "are"

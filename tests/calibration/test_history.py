@@ -107,9 +107,9 @@ def test_library_and_unknown_dates(years, tmp_path):
 
 def test_change_is_found_where_it_is(years):
     table = changes(years)
-    assert len(table) == 2 * 4
+    assert len(table) == 2 * 5
     for row in table:
-        changed = row["what"] == "derotator" and row["before"] == "run1"
+        changed = row["what"] in ("all", "derotator") and row["before"] == "run1"
         assert (row["sigma"] > 15) == changed, row
         if not changed:
             assert row["sigma"] < 3.5
@@ -198,7 +198,7 @@ def test_what_is_open_in_all_takes_no_more_with_each_run_nor_in_another_gauge():
         assert (found.sigma < 4) == (k < 5), found
     (row,) = courses(runs, ["derotator"])
     assert row["course"] == "steps"
-    assert row["change"].round(2).tolist() == [0, 0, 0, 1, 0, 0]
+    assert row["when"] == "2023-02-01 to 2024-02-01"
 
 
 def test_what_a_prior_closes_does_not_count():

@@ -31,6 +31,8 @@ _OTHER = 0.1
 # a walk or a scatter of more numbers than this is looked for with simpler laws only
 _MOST_NUMBERS = 600
 _RANK = 1e-12
+# a step is in the gaps that are named with this probability
+_IN_SPAN = 0.95
 
 
 def moment_of(when, name):
@@ -178,6 +180,17 @@ class Weighed:
         course = max(courses, key=self.chances.get)
         own = [one for one in self.tries if one.course == course]
         return max(own, key=lambda one: one.evidence, default=None)
+
+    def span(self):
+        """Return the first and the last gap between runs in which a step may be (95 %)."""
+        told = np.array([(t.gap, t.evidence) for t in self.tries if t.course == "steps"])
+        chance = np.bincount(told[:, 0].astype(int), np.exp(told[:, 1] - told[:, 1].max()))
+        chance /= chance.sum()
+        first = last = int(np.argmax(chance))
+        while chance[first : last + 1].sum() < _IN_SPAN:
+            before, after = chance[:first].sum(), chance[last + 1 :].sum()
+            first, last = (first - 1, last) if before > after else (first, last + 1)
+        return first, last
 
 
 def weigh(deviations, waves, chances):

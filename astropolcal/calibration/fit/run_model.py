@@ -380,6 +380,32 @@ class Model:
         weights = np.exp([odds[what] - odds[term.what] for what in rivals])
         return found[term.what], rivals, float(1 / (1 + weights.sum()))
 
+    def courses(self):
+        """Return what each optic does, a row each, and the gaps in which each of its steps is.
+
+        See `astropolcal.calibration.fit.runs.RunsCalibration`.
+        """
+        own, rows, spans, days = {}, [], [], sorted(self.dates.isot)
+        for term in self.terms:
+            own.setdefault(term.what, []).append(term)
+        for what, terms in own.items():
+            judged = [self.final(term) for term in terms]
+            # of several steps the last one is judged
+            told, rivals, share = judged[-1]
+            pairs = zip(terms, judged, strict=True)
+            spans.append(sorted(one.span() for term, (one, *_) in pairs if term.gap is not None))
+            row = {"what": what, "course": terms[-1].course}
+            row["probability"] = (1 - told.chances["constant"]) * share
+            row |= told.chances
+            row["when"] = ", ".join(f"{days[a][:10]} to {days[b + 1][:10]}" for a, b in spans[-1])
+            rows.append(row | {"or": ", ".join(rivals)})
+        for what, told in self.weighed().items():
+            if what == optic(what) and what not in map(optic, own):
+                row = {"what": what, "course": "constant", "probability": told.chances["constant"]}
+                rows.append(row | told.chances | {"when": "", "or": ""})
+                spans.append([])
+        return rows, spans
+
     # ---- errors
 
     def errors_of(self, i):

@@ -41,7 +41,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, understood
 from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import refuse_repeated
-from astropolcal.measurement.parameters import optic, stem, told_prior
+from astropolcal.measurement.parameters import stem, told_prior
 from astropolcal.observations import Observations
 from astropolcal.observations.reading import dates_of
 from astropolcal.progress import in_one_thread, stage, steps
@@ -357,9 +357,9 @@ class RunsCalibration:
     courses : `~astropy.table.Table`
         One row per optic that all runs share, or its parameter: ``what``; its ``course`` in the
         model; the ``probability`` that this is what varies, or that it is constant; that of each
-        course, beside all others; ``when``, between which runs it changed; ``or``, what would
-        explain the data nearly as well in its place. Two runs differ by steps only. Empty without
-        dates.
+        course, beside all others; ``when``, between which runs it changed (95 %); ``or``, what
+        would explain the data nearly as well in its place. Two runs differ by steps only. Empty
+        without dates.
     runs : `~astropy.table.QTable`
         One row per run: ``date``, ``tables``, and the root mean square of its residuals with the
         parameters of all runs, ``rms``, and with those of this run alone, ``rms_alone``;
@@ -398,26 +398,9 @@ class RunsCalibration:
         return {row["what"]: row["course"] for row in self.courses if row["course"] != "constant"}
 
     def _courses(self):
-        model, rows = self._model, []
-        if model.dates is None:
+        if self._model.dates is None:
             return Table(names=("what", "course"), dtype=(str, str))
-        own, days = {}, sorted(self.dates.isot)
-        for term in model.terms:
-            own.setdefault(term.what, []).append(term)
-        for what, terms in own.items():
-            # of several steps the last one is judged
-            told, rivals, share = model.final(terms[-1])
-            gaps = sorted(term.gap for term in terms if term.gap is not None)
-            row = {"what": what, "course": terms[-1].course}
-            row["probability"] = (1 - told.chances["constant"]) * share
-            row |= told.chances
-            row["when"] = ", ".join(f"{days[k][:10]} to {days[k + 1][:10]}" for k in gaps)
-            rows.append(row | {"or": ", ".join(rivals)})
-        for what, told in model.weighed().items():
-            if what == optic(what) and what not in map(optic, own):
-                row = {"what": what, "course": "constant", "probability": told.chances["constant"]}
-                rows.append(row | told.chances | {"when": "", "or": ""})
-        return Table(rows=rows)
+        return Table(rows=self._model.courses()[0])
 
     def _runs(self):
         model = self._model
