@@ -540,7 +540,7 @@ def courses(calibrations, parameters=None, *, events=()):
     found, rows, spans = compared(named, parameters), [], []
     if found.slopes.size:
         # something is determined in all of them
-        model = Model(_Standing(found, named[0][1]), (), dates, events)
+        model = Model(_Standing(found, [one for _, one in named]), (), dates, events)
         model.search()
         rows, spans = model.courses()
     table, names = Table(rows=rows), [name for name, _ in named]
@@ -552,8 +552,9 @@ def courses(calibrations, parameters=None, *, events=()):
 class _Standing:
     """Calibrations as runs of which the rows stay, in what all of them determine."""
 
-    def __init__(self, found, first):
-        units = dict(zip(first.covariance.names, first.covariance.units, strict=True))
+    def __init__(self, found, calibrations):
+        known = calibrations[0].covariance
+        units = dict(zip(known.names, known.units, strict=True))
         steps = np.array([declared_step(units[name]) for name in found.names])
         size, count = len(found.names), len(found.weights)
         free = SimpleNamespace(
@@ -564,12 +565,13 @@ class _Standing:
             prior_residuals=lambda vector: np.empty(0),
         )
         self.shapes, self.alone = [SimpleNamespace(free=free)] * count, [np.zeros(size)] * count
-        roots = np.swapaxes(np.linalg.cholesky(found.weights), 1, 2)
-        seen = zip(roots, found.deviations, strict=True)
-        self.rows = [
-            SimpleNamespace(rows=root @ found.slopes * steps, targets=root @ off, chi2=0.0)
-            for root, off in seen
-        ]
+        told = [(one.fit.get("model_error") or {}).get("settings") for one in calibrations]
+        self.rows = []
+        for weight, off, settings in zip(found.weights, found.deviations, told, strict=True):
+            root = np.linalg.cholesky(weight).T
+            rows, targets = root @ found.slopes * steps, root @ off
+            one = SimpleNamespace(rows=rows, targets=targets, chi2=0.0, settings=settings)
+            self.rows.append(one)
 
     def around(self, vectors):
         """Return the rows of all calibrations."""

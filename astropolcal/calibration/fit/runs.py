@@ -33,7 +33,7 @@ from astropolcal.calibration.fit.run_model import Model as _Coefficients
 from astropolcal.calibration.fit.strategies import joint, stands_out
 from astropolcal.calibration.identifiability.linearized import Whitened
 from astropolcal.calibration.noise.estimates import rms
-from astropolcal.calibration.noise.scatter import Scatter
+from astropolcal.calibration.noise.scatter import Scatter, model_error
 from astropolcal.calibration.noise.weighting import Problem, first_weighting
 from astropolcal.calibration.uncertainty.covariance import covariance_along
 from astropolcal.chain import leaves
@@ -224,13 +224,17 @@ class _Checkpoint:
 
 @dataclass
 class _Rows:
-    """A run around its parameters: rows and targets of unit noise, and its sum of squares."""
+    """A run around its parameters: rows and targets of unit noise, and its sum of squares.
+
+    With the number of settings whose errors its residuals tell, None where they tell none.
+    """
 
     rows: np.ndarray
     targets: np.ndarray
     chi2: float
     rms: float
     stands_out: bool
+    settings: int | None
 
 
 class _Run:
@@ -256,6 +260,7 @@ class _Run:
         #: Of the fit of this run alone, canonical.
         self.fitted, self.level = measurement.vector(), weighting.level
         self.stands_out = stands_out(measurement)
+        self.settings = (model_error(measurement, self.scatter, np.zeros(0)) or {}).get("settings")
         if not np.isfinite(self.level):
             raise FitError(f"{tables[0].name}: no datum is left over to tell the noise of the run")
         # noise that rounding alone makes would give a run all the weight
@@ -290,7 +295,8 @@ class _Run:
         rows = root @ (found.singular[: found.rank, None] * found.right[: found.rank])
         targets = rows @ (vector / self.scale) + root @ (along.T @ residual)
         square = float(residual @ residual)
-        return _Rows(rows, targets, square / self.level**2, rms(residual), self.stands_out)
+        told = rms(residual), self.stands_out, self.settings
+        return _Rows(rows, targets, square / self.level**2, *told)
 
 
 # runs that a process has prepared, by what calls for them and number
