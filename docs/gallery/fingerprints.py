@@ -262,7 +262,7 @@ def draw_rows(figure, rows, columns):
     Parameters
     ----------
     figure : `~matplotlib.figure.Figure`
-        With a constrained layout, or a subfigure.
+        With a constrained layout, with room around its axes, or a subfigure.
     rows : list of (str, list of `~numpy.ndarray`)
         Label and three images.
     columns : tuple of str

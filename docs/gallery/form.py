@@ -91,11 +91,14 @@ def _functions(values):
 
 
 def _find(numbers, table):
-    for latex, known in table:
-        if np.allclose(numbers, known, rtol=1e-9, atol=1e-11):
+    known = np.array([values for _, values in table]).reshape(len(table), -1)
+    near = 1e-11 + 1e-9 * np.abs(known)
+    same, opposite = (np.all(np.abs(numbers - s * known) <= near, axis=1) for s in (1, -1))
+    for row in np.flatnonzero(same | opposite)[:1]:
+        latex = table[row][0]
+        if same[row]:
             return latex
-        if np.allclose(numbers, -known, rtol=1e-9, atol=1e-11):
-            return f"-{latex}" if not latex.startswith("1 ") else f"-({latex})"
+        return f"-{latex}" if not latex.startswith("1 ") else f"-({latex})"
     return None
 
 

@@ -38,10 +38,10 @@ def cal(make):
 
 @pytest.mark.slow
 def test_one_sided_error_is_where_the_profile_has_risen_by_one(make):
-    for weights in [None, "errors"]:
-        # far from the bound, near it, at the lower one, and several at bounds that correlate
-        cases = [((85, 90.2), None), ((85, 90.39), None), ((90.5, 95), None), ((85, 90.2), 0.965)]
-        for bounds, efficiency in cases:
+    # far from the bound, near it, at the lower one, and several at bounds that correlate
+    cases = [((85, 90.2), None), ((85, 90.39), None), ((90.5, 95), None), ((85, 90.2), 0.965)]
+    for weights, some in [(None, cases), ("errors", cases[-1:])]:
+        for bounds, efficiency in some:
             cal = fitted(make, bounds, efficiency=efficiency, weights=weights)
             assert POLARIZER in cal.at_bound, weights
             assert len(cal.at_bound) > 1 or efficiency is None, weights

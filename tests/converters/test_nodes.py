@@ -27,9 +27,11 @@ from astropolcal.converters.nodes import (
 from astropolcal.exceptions import CalibrationFileError
 from astropolcal.optics import LinearRetarder
 
-leaf = st.none() | st.booleans() | st.integers(-99, 99) | st.floats(allow_nan=False) | st.text()
+# of all characters, hypothesis would first make a table, which takes seconds
+text = st.text("aZ0 _.:~\"'\\\n\t\0é中\U0001f52d")
+leaf = st.none() | st.booleans() | st.integers(-99, 99) | st.floats(allow_nan=False) | text
 trees = st.recursive(
-    leaf, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=10
+    leaf, lambda inner: st.lists(inner) | st.dictionaries(text, inner), max_leaves=10
 )
 
 

@@ -89,7 +89,7 @@ def an_optic(draw, name):
         extra["mount"] = draw(st.sampled_from([None, "hwp", "-altitude", "nul l"]))
     declared = cls()._declared
     optic = cls(
-        name=draw(st.none() | st.text(max_size=8)),
+        name=draw(st.none() | st.text("aZ0 _:~\"'\\\n\té中\U0001f52d", max_size=8)),
         **{key: np.array(draw(value)) * (declared(key).unit or 1) for key in cls.param_names},
         **extra,
     )

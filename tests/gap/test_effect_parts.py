@@ -119,7 +119,7 @@ def test_laws_limits_and_priors_of_an_edit():
 
 
 @pytest.mark.slow
-@given(st.text(min_size=1, max_size=12))
+@given(st.text("aZ0 _.:/~\"'\\\n\té中", min_size=1, max_size=12))
 def test_label_is_a_name_that_an_optic_may_have(name):
     label = label_of(name)
     assert label.startswith("gap_")
