@@ -9,7 +9,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from astropolcal import calibrate, instruments
+from astropolcal import Observations, calibrate, instruments
 from astropolcal.calibration.result.calibration import validity_of, with_validity
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.pipeline import Entry, Library, changes, courses, health, parameter_history
@@ -111,6 +111,23 @@ def test_what_only_a_combination_of_optics_tells_is_a_change(steady):
     found = by_optic(courses(runs))
     assert found["hwp.theta"]["probability"] > 0.9
     assert found["hwp.theta"]["when"] == "2021-01-01 to 2021-07-01"
+
+
+@pytest.mark.slow
+def test_errors_that_rest_on_few_settings_are_no_change():
+    """The derotator stops somewhere else at each of four settings, in each run."""
+    for seed in range(3):
+        rng, runs = np.random.default_rng(seed), []
+        for i in range(6):
+            seen = FRAMES.copy()
+            seen["derotator"] = seen["derotator"] + np.repeat(rng.normal(0, 0.15, 4), 8) * u.deg
+            meta = {"date": f"{2010 + i}-01-01", "source": "polarized"}
+            noise = {"seed": 10 * seed + i, "flux": 3e6}
+            table = simulate(CHAIN, WAVELENGTH, seen, meta=meta, **noise).to_table()
+            table["derotator"] = FRAMES["derotator"][np.asarray(table["frame"])]
+            data = Observations.from_table(table, name=f"run {i}")
+            runs.append(calibrate(CHAIN, data, instrument="charis", cross_validate=False))
+        assert set(courses(runs)["course"]) == {"constant"}, seed
 
 
 def test_another_turn_of_a_retardance_is_no_change(steady):
