@@ -13,6 +13,7 @@ from astropolcal.calibration.result.calibration import folded
 from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.files import atomic_path, plain, printable
 from astropolcal.instruments import Instrument
+from astropolcal.measurement.parameters import optic
 from astropolcal.pipeline.headers import date_of, days_of
 from astropolcal.pipeline.history import courses
 from astropolcal.pipeline.library import Library
@@ -148,8 +149,12 @@ def _group(entries, rows, moment, goal, limit, events):
             found = ()
             few = f"{counted(len(dated), 'calibration')} with a date; courses need at least three"
             left_out.append(few if len(dated) < 3 else str(problem))
+    doubtful = {optic(one) for row in found for one in row["or"].split(", ")}
     for row, steps in zip(found, found.meta["steps"] if len(found) else (), strict=True):
         what, course = row["what"], row["course"]
+        if course == "constant" and what in doubtful:
+            # it may be what another row says of another optic
+            continue
         rivals = [one for one in row["or"].split(", ") if one]
         known = {"what": what, "or": rivals, "course": course}
         told, surely = listed([what, *rivals], "or"), 1 - row["constant"]

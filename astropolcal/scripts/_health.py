@@ -84,5 +84,7 @@ def _figures(library, group, goal):
     for one in group["courses"] if len(entries) > 1 else ():
         # more parameters than a figure holds; the courses are in the table
         with suppress(ParameterError):
-            found[one["words"]] = plot_history(entries, [one["what"]], title=one["words"])
+            figure = plot_history(entries, [one["what"]], title=one["words"])
+            alone = f"{one['words']}. What only a combination of optics tells does not show here"
+            found[one["words"] if one["course"] == "constant" else alone] = figure
     return {caption: figure_source(figure, 110) for caption, figure in found.items()}
