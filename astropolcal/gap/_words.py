@@ -38,11 +38,11 @@ _TARGETS = 2
 _ONE_THING = {
     "course": " Both follow the same thing: they may be one that no table has.",
     "action": " Both are of one place and kind: they may be one thing with a course of its own.",
-    "optic": " Both are one optic, whose axes are oblique, or one cause of two laws.",
+    "optic": " Both are one optic of oblique axes or an elliptical one, or one cause of two laws.",
     "": "",
 }
-# what no table has, by place and kind of what does the same if it changes: of the signal of simulated
-# added light up to 93 %, of wavelengths of one beam 99 %, of a scale that changes 92 to 99 %
+# what no table has, by place and kind of what does the same if it changes: in simulations up to 93 %
+# of the signal of added light, 99 % of that of one beam, 92 to 99 % of that of a scale
 _NOT_ASKED = (
     ("after:", "depolarization", "Added light, such as a background, that changes so"),
     ("after:", "diattenuation_c", "Other wavelengths, or another band, of one of the beams"),
