@@ -41,8 +41,8 @@ _ONE_THING = {
     "optic": " Both are one optic of oblique axes or an elliptical one, or one cause of two laws.",
     "": "",
 }
-# what no table has, by place and kind of what does the same if it changes: in simulations up to 93 %
-# of the signal of added light, 99 % of that of one beam, 92 to 99 % of that of a scale
+# what no table has, by place and kind of what does the same if it changes: in simulations up to
+# 93 % of the signal of added light, 99 % of that of one beam, 92 to 99 % of that of a scale
 _NOT_ASKED = (
     ("after:", "depolarization", "Added light, such as a background, that changes so"),
     ("after:", "diattenuation_c", "Other wavelengths, or another band, of one of the beams"),
