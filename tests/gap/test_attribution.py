@@ -122,7 +122,6 @@ def test_another_component_of_an_optic_that_is_a_cause_is_as_good_as_a_name(mode
     """An elliptical derotator was given as a retarder and an anisotropic depolarizer."""
     asked = {
         "in:derotator/rotation/constant": True,
-        "in:derotator/retardance_h/constant": True,
         "in:derotator/rotation/time": False,
         "in:hwp/retardance_h/constant": False,
         "after:derotator/depolarization_d/constant": False,
