@@ -38,9 +38,16 @@ _TARGETS = 2
 _ONE_THING = {
     "course": " Both follow the same thing: they may be one that no table has.",
     "action": " Both are of one place and kind: they may be one thing with a course of its own.",
-    "optic": " Both are one optic, whose axes are oblique, or one cause of two laws.",
+    "optic": " Both are one optic of oblique axes or an elliptical one, or one cause of two laws.",
     "": "",
 }
+# what no table has, by place and kind of what does the same if it changes: in simulations up to
+# 93 % of the signal of added light, 99 % of that of one beam, 92 to 99 % of that of a scale
+_NOT_ASKED = (
+    ("after:", "depolarization", "Added light, such as a background, that changes so"),
+    ("after:", "diattenuation_c", "Other wavelengths, or another band, of one of the beams"),
+    ("in:", "retardance_h", "A wavelength scale that changes so"),
+)
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
 # what the amplitude of a cell is, by its dependence
 _AMPLITUDES = {
@@ -290,10 +297,12 @@ def details(entry, ranks):
             f"It resembles {listed(both)}: the data ask for both, "
             "but how much belongs to which is uncertain."
         )
-    cell = entry["cell"] or {"kind": ""}
-    if cell["kind"].startswith("depolarization") and cell["place"].startswith("after:"):
-        changes = not cell["dependence"].startswith(("constant", "dataset"))
-        texts += ["Added light, such as a background, that changes so may do the same."] * changes
+    likely = [entry, *(one for one in entry["aliases"] if one["probability"] > _UNLIKELY)]
+    cells = [one["cell"] for one in likely if one["cell"]]
+    for place, kind, what in _NOT_ASKED:
+        seen = (c for c in cells if c["place"].startswith(place) and c["kind"].startswith(kind))
+        if not all(c["dependence"].startswith(("constant", "dataset")) for c in seen):
+            texts.append(f"{what} may do the same.")
     if entry["kind"] == "discrete":
         return [*texts, "It is an alternative to the model and has no size."]
     strength, rest = entry["significance"], entry["trades_with"]

@@ -16,7 +16,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from astropolcal.calibration.validation.cross_validation import chi2_above
-from astropolcal.gap.cells import Cell, Probes, Reduced
+from astropolcal.gap.cells import Cell, Probes, Reduced, alike
 from astropolcal.gap.effects.effect import CellEffect
 from astropolcal.gap.problem import GapProblem, law_basis
 from astropolcal.optics.perturbations import split_run
@@ -37,7 +37,7 @@ _TOGETHER = 20
 ENOUGH = 10.0
 #: What explains the data less well than another by less than this (log evidence) is its alias.
 ALIKE = 7.0
-#: Prior odds of a name against a cell of the table.
+#: Prior odds of a name, or of another component of an optic, against a cell of the table.
 NAMED = 5.0
 # log prior odds of dependences: what changes needs a reason
 _DEPENDENCE = {
@@ -267,7 +267,7 @@ def _cells(probes, temper):
             found += sorted(bent, key=preference)[:1]
         for same, waves in probes.grouped(names):
             by_law = [(degree, part.normal(waves)) for degree, part in parts.items()]
-            found += _candidates(place, kind, same, by_law, temper)
+            found += _candidates(probes, place, kind, same, by_law, temper)
     # where none of these laws is half as good as one that is free
     least = max([ENOUGH, *(_SHARPER * one.evidence for one in found)])
     has_freer = len(basis) > basis.shape[1]
@@ -331,14 +331,15 @@ def _of_cell(probes, cell, degree, temper, others=()):
         names = [one.dependence for one in cells]
     else:
         names, parts = [cell.dependence], [part[None] for part in bent]
-    found = _candidates(cell.place, cell.kind, names, [(degree, parts)], temper)
+    found = _candidates(probes, cell.place, cell.kind, names, [(degree, parts)], temper)
     return sorted(found, key=preference)
 
 
-def _candidates(place, kind, names, by_law, temper):
+def _candidates(probes, place, kind, names, by_law, temper):
     """Return the candidates of dependences from (degree, normal equations), of the better law."""
     cells, best = [Cell(place, kind, name) for name in names], {}
     scales = np.array([cell.scale for cell in cells])
+    others = [Cell(*name.split("/", 2)) for name in probes.own if name.count("/") > 1]
     for degree, (gram, target) in by_law:
         values, share = _spectra(gram, target)
         factors, ranks = log_factor(values, share, scales, temper), _rank(values, scales)
@@ -347,7 +348,9 @@ def _candidates(place, kind, names, by_law, temper):
                 best[i] = (factors[i], int(ranks[i]), values[i], share[i], degree)
     found = []
     for i, (factor, rank, values, share, degree) in best.items():
-        prior = _prior(names[i])
+        # another component of an optic that is a cause already is no worse than a name
+        is_one = any(alike([cells[i], other]) == "optic" for other in others)
+        prior = _prior(names[i]) + is_one * float(np.log(NAMED))
         evidence, spectrum = float(factor) + prior, (values, share, float(scales[i]))
         statistic = float(share.sum())
         found.append(Candidate(None, cells[i], statistic, rank, evidence, prior, spectrum, degree))

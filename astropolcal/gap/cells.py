@@ -40,6 +40,8 @@ DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
 # name
 _COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step"))
 _COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
+# the components of an elliptical retarder
+_RETARDER = {"retardance_h", "retardance_d", "rotation"}
 # what all frames have, or runs, or what a kind brings with it, is no course
 _NO_COURSE = ("constant", "dataset", *dict.fromkeys(DETECTED.values()))
 _SKY = ("parallactic", "altitude")
@@ -216,6 +218,9 @@ def alike(cells):
         stem = one.kind.rpartition("_")[0]
         beams = other.kind == "gain" and one.place.startswith("after:")
         pair = {one.kind, kind} == {f"{stem}_h", f"{stem}_d"}
+        # and a retarder that does not change may be elliptical
+        static = one.dependence.startswith(("constant", "dataset"))
+        pair |= static and one.kind != kind and {one.kind, kind} < _RETARDER
         if (beams or one.place == other.place) and (pair or one.kind == other.kind):
             return "optic"
     if one.dependence == other.dependence and not one.dependence.startswith(_NO_COURSE):

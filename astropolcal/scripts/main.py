@@ -26,6 +26,7 @@ from _thread import interrupt_main
 from contextlib import nullcontext
 from functools import partial
 from importlib import import_module
+from itertools import takewhile
 
 from astropolcal.version import version
 from astropolcal.words import did_you_mean
@@ -58,12 +59,19 @@ class _OneLineParser(argparse.ArgumentParser):
     def parse_known_args(self, args=None, namespace=None):
         from astropolcal.scripts._common import check_together
 
-        namespace, unknown = super().parse_known_args(args, namespace)
+        # an unknown option first: what follows it would be taken for something else
+        given = [text.partition("=")[0] for text in takewhile("--".__ne__, args or ())]
+        known, unknown = self._option_string_actions, []
+        if self._subparsers is None:
+            given = (name for name in given if name.startswith("--"))
+            unknown = [name for name in given if not any(one.startswith(name) for one in known)]
+        if not unknown:
+            namespace, unknown = super().parse_known_args(args, namespace)
         if unknown:
             # here, where the command is known: argparse complains in the name of the whole program
             name = unknown[0].partition("=")[0]
             # two dashes alone make short names alike
-            hint = did_you_mean(name, self._option_string_actions, cutoff=0.75)
+            hint = did_you_mean(name, known, cutoff=0.75)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         check_together(self._actions, namespace)
         return namespace, unknown

@@ -118,6 +118,24 @@ def test_what_the_data_leave_open_costs_nothing(model):
             assert found[1] > found[0] + 3 > 5
 
 
+def test_another_component_of_an_optic_that_is_a_cause_is_as_good_as_a_name(model):
+    """An elliptical derotator was given as a retarder and an anisotropic depolarizer."""
+    asked = {
+        "in:derotator/rotation/constant": True,
+        "in:derotator/rotation/time": False,
+        "in:hwp/retardance_h/constant": False,
+        "after:derotator/depolarization_d/constant": False,
+    }
+    own = CellEffect(Cell("in:derotator", "retardance_d", "constant"), 0)
+    before, after = (
+        {one.name: one.prior for one in scan(each).candidates}
+        for each in (model, model.edited((own, None)))
+    )
+    for name, favoured in asked.items():
+        expected = before[name] + favoured * np.log(NAMED)
+        assert after[name] == pytest.approx(expected), name
+
+
 def test_every_question_is_asked_once_and_the_best_answer_comes_first(model, found):
     evidence = [one.evidence for one in found.candidates]
     names = [one.name for one in found.candidates]

@@ -97,15 +97,23 @@ def said(one, ranks=()):
     return _words.cause(one | {"details": _words.details(one, dict(ranks))})
 
 
-def test_added_light_that_changes_looks_like_a_depolarization():
-    for where_it_is, kind, dependence, told in (
-        ("after:derotator", "depolarization_h", "time", True),
-        ("after:derotator", "depolarization_h", "constant", False),
-        ("in:derotator", "depolarization_h", "time", False),
-        ("after:derotator", "retardance_h", "time", False),
-    ):
-        words = said(entry(cell(where_it_is, kind, dependence)))
-        assert ("background" in words) == told
+def test_what_is_not_asked_for_and_looks_like_a_cause_is_told():
+    every = ("background", "one of the beams", "wavelength scale")
+    told = {
+        ("after:derotator", "depolarization_h", "time"): {"background"},
+        ("after:derotator", "depolarization_h", "constant"): set(),
+        ("in:derotator", "depolarization_h", "time"): set(),
+        ("after:derotator", "diattenuation_c", "harmonic:derotator:2"): {"one of the beams"},
+        ("after:derotator", "retardance_h", "time"): set(),
+        ("in:derotator", "retardance_h", "time"): {"wavelength scale"},
+    }
+    for one, what in told.items():
+        words = said(entry(cell(*one)))
+        assert {word for word in every if word in words} == what, one
+        # of an alias, too, unless it is hardly probable
+        for probability, expected in ((0.3, what), (0.001, set())):
+            words = said(entry(cell("source"), aliases=[cell(*one, probability=probability)]))
+            assert {word for word in every if word in words} == expected, one
 
 
 # ---- numbers and names ----------------------------------------------------------------------

@@ -161,6 +161,7 @@ def test_options_that_cannot_be_understood(capsys):
             ["calibrate", "--derotater", "linear"],
             "--derotater; did you mean '--derotator'? (see astropolcal calibrate --help)",
         ),
+        (["challenge", "--figure", "x"], "unrecognized arguments: --figure (see"),
         (["correct", "x"], "required: --calibration (see astropolcal correct --help)"),
         (["correct", "--size", "wide"], "argument --size: 'wide' is not a whole number"),
         (["correct", "--size", "2_1"], "argument --size: '2_1' is not a whole number"),
