@@ -214,8 +214,8 @@ def _carried_off(calibration):
 
 def _of_lamp(calibration):
     """Name the parameter that the brightness of frames moves by more than its other errors."""
-    moved = calibration.fit.get("lamp_moves") or {"errors": 0.0}
-    if not moved["errors"] > 1:
+    moved = calibration.fit.get("lamp_moves") or {}
+    if not moved.get("counts"):
         return []
     counted = "not" if calibration.settings["errors"] == "white" else "now"
     return [
