@@ -338,7 +338,8 @@ def undecided_signs(measurement, view, stds, minima, lawful=()):
     of its ``stds`` has no sign. With them the mean squares of the errors of q and u that the other
     signs would be on sky, times their probabilities: in proportion to the polarization and apart
     from it, (2, n_wavelengths); zero where the phases beside tell the sign. And the roots of those
-    of all parameters but what has the other sign, (n_free,). What is ``lawful`` stays as it is.
+    of parameters, in their units by name, where these are longer than ``stds``, but for what has
+    the other sign. What is ``lawful`` stays as it is.
     """
     problem = BinProblem(measurement, measurement.weighting)
     kept = [row for row, slot in enumerate(problem.slots) if slot.name in lawful]
@@ -396,7 +397,10 @@ def undecided_signs(measurement, view, stds, minima, lawful=()):
                 other = seen_with(view, measurement.put_back(there))
                 errors = np.maximum(errors, share * mean_errors(view, other))
     elsewhere, further, farther = _elsewhere(measurement, view, stds, minima)
-    return found + elsewhere, np.maximum(errors, further), np.maximum(away, farther)
+    free, away = measurement.free, np.maximum(away, farther)
+    far = zip(free.names, away / free.factors(), away > stds, strict=True)
+    longer = {name: float(error) for name, error, is_longer in far if is_longer}
+    return found + elsewhere, np.maximum(errors, further), longer
 
 
 def _elsewhere(measurement, view, stds, minima):

@@ -525,9 +525,7 @@ def _result(fitted, covariance=None):
         own, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own, white)
     stds = own.stds * measurement.free.factors()
     others = fit.pop("others", ()), fitted.lawful
-    signs, errors_of_signs, away = undecided_signs(measurement, view, stds, *others)
-    far = zip(names, away / measurement.free.factors(), own.stds, strict=True)
-    fit["elsewhere"] = {name: float(error) for name, error, std in far if error > std}
+    signs, errors_of_signs, fit["elsewhere"] = undecided_signs(measurement, view, stds, *others)
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
