@@ -202,13 +202,25 @@ class Dataset:
         predicted = self.observable.evaluate(*self._fluxes(sweep))
         return predicted.ravel() if self._all_valid else predicted[self.valid]
 
-    def of_lamp(self, sweep):
-        """Return what the data gain where frames are as bright as in the table, (n_data,)."""
+    def brightness(self, sweep):
+        """Return how bright frames are in the table, over the model and the mean of their group.
+
+        Shape (frames_per_datum, n_data), and its derivatives (frames_per_datum, n_free, n_data).
+        """
         right, left = self._fluxes(sweep)
         observed = self.observations.flux_right + self.observations.flux_left
         observed = self._grouped(observed[self.frames.T.ravel()].T)
-        bright = np.where(self.valid, observed, 1.0) / np.where(self.valid, right + left, 1.0)
-        with_lamp = self.observable.evaluate(right * bright, left * bright)
+        model = np.where(self.valid, right + left, 1.0)
+        bright = np.where(self.valid, observed, 1.0) / model
+        bright, each = bright / bright.mean(axis=0), np.eye(len(bright))[..., None, None] / -model
+        slopes = np.array([self.jacobian(sweep, derivative=(one, one)) for one in each])
+        return bright[:, self.valid], slopes - slopes.mean(axis=0)
+
+    def of_lamp(self, sweep, bright):
+        """Return what the data gain where frames are so bright, (n_data,)."""
+        factor = np.ones((len(bright), *self.valid.shape))
+        factor[:, self.valid] = bright
+        with_lamp = self.observable.evaluate(*(flux * factor for flux in self._fluxes(sweep)))
         return with_lamp[self.valid] - self.values(sweep)
 
     def forward(self, vector):
@@ -222,11 +234,15 @@ class Dataset:
             values[i][j] = factor * vector[where] + offset
         return values
 
-    def jacobian(self, sweep, among=None):
-        """Return the derivative of the data to the flat vector, (n_free, n_data)."""
+    def jacobian(self, sweep, among=None, derivative=None):
+        """Return the derivative of the data to the flat vector, (n_free, n_data).
+
+        Or of what has a ``derivative`` to the fluxes of both beams of its group.
+        """
         live = [one for one in self._live if among is None or np.any(among[one[1]])]
         right, left = self._fluxes(sweep)
-        derivative = self.observable.derivative(right, left)
+        own = derivative is None
+        derivative = self.observable.derivative(right, left) if own else derivative
         # the weights of columns are spread over the nodes of their exposures
         columns = [d.transpose(1, 0, 2).reshape(d.shape[1], 1, -1) for d in derivative]
         weights = [(c * self._node_weights[:, None]).reshape(len(c), -1) for c in columns]
@@ -241,7 +257,7 @@ class Dataset:
             # a value per wavelength moves the data of its own wavelength
             # only, one for all moves all of them
             out[where, each] += slope
-        out = self.observable.gathered(out, right, left)
+        out = self.observable.gathered(out, right, left) if own else out
         return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
 
 

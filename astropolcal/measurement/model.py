@@ -25,6 +25,9 @@ from astropolcal.units import to_unit
 
 __all__ = ["Measurement"]
 
+# what changes the brightness of frames by less than a hundredth of what changes it most, squared
+_SEEN = 1e-4
+
 
 class Measurement(ScalarParameters):
     """
@@ -277,12 +280,24 @@ class Measurement(ScalarParameters):
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def of_lamp(self, vector):
-        """Return what all predicted data gain by the brightness of each frame, (n_data,)."""
+        """Return what all predicted data gain by the brightness of each frame, (n_data,).
+
+        By what no free parameter explains of it: how bright frames are tells more of some, such as
+        a diattenuation, than the data do.
+        """
         if self.observable.name == "intensity":
             # in which the brightness is free anyway
             return np.zeros(self.n_data)
-        pairs = zip(self.datasets, self._sweeps(vector), strict=True)
-        return np.concatenate([dataset.of_lamp(sweep) for dataset, sweep in pairs])
+        sweeps = self._sweeps(vector)
+        parts = [d.brightness(s) for d, s in zip(self.datasets, sweeps, strict=True)]
+        bright, slopes = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
+        slopes *= self.free.steps[:, None]
+        square = np.einsum("kfd,kgd->fg", slopes, slopes, optimize=True)
+        step = np.linalg.lstsq(square, np.einsum("kfd,kd->f", slopes, bright), rcond=_SEEN)[0]
+        bright = bright - np.einsum("kfd,f->kd", slopes, step)
+        ends = np.cumsum([d.n_data for d in self.datasets])[:-1]
+        each = zip(self.datasets, sweeps, np.split(bright, ends, axis=1), strict=True)
+        return np.concatenate([dataset.of_lamp(*told) for dataset, *told in each])
 
     def jacobian(self, vector, among=None):
         """

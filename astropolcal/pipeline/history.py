@@ -25,11 +25,11 @@ from astropy.time import Time
 
 from astropolcal.calibration.fit.calibrate import calibrate
 from astropolcal.calibration.fit.run_model import Model
-from astropolcal.calibration.identifiability.sky import known_instrument
-from astropolcal.calibration.system import free_of
+from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
+from astropolcal.calibration.system import free_of, split_chain
 from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
 from astropolcal.calibration.validation.targets import keep_sky_accuracy, target_accuracies
-from astropolcal.chain import join, leaves
+from astropolcal.chain import join, leaves, stages
 from astropolcal.converters.calibration import content_hash
 from astropolcal.exceptions import FitError, ParameterError, warn
 from astropolcal.measurement import parameter_table
@@ -607,7 +607,8 @@ def restart(calibration, observations, free, *, chain=None, **options):
     Calibration
         With the errors of what was refitted as if what was held were exact. In the accuracy on sky
         are those of both, as errors of degree and angle.
-        ``settings["restarted"]`` holds the hash of the old one and what was free.
+        ``settings["restarted"]`` holds the hash and date of the old one and what was free. A
+        telescope is held only where one of the tables is of a star, such as the old one's.
 
     Raises
     ------
@@ -651,10 +652,18 @@ def restart(calibration, observations, free, *, chain=None, **options):
     new = calibrate(chains, datasets, **(start | options))
     # what is held has no error, though it was not known
     known, fitted = old.parameter_values(), {*map(stem, new.covariance.names)}
-    open_ = [n for n in known if n in table and n not in fitted and "open" in known[n]["status"]]
+    held, before = {n for n in known if n in table} - fitted, old.settings.get("restarted", {})
+    told = {"open": [n for n in known if n in held and "open" in known[n]["status"]]}
+    told["open"] += [n for n in before.get("open", ()) if n in held]
+    # of a telescope that no new frame was taken through nothing is in the new chains
+    if not any("parallactic" in stages(c) for c in chains):
+        seen = (chain_from_sky([c])[0] for c in old.chains if "parallactic" in stages(c))
+        outer = {leaf.name: 0 for c in seen for leaf in split_chain(c)[0] if not leaf.stage}
+        told["lost"] = [*outer] or before.get("lost")
     new.settings["restarted"] = {"from": content_hash(old), "free": free}
-    new.settings["restarted"] |= {"open": open_} if open_ else {}
-    if held := _errors_of_held(old, set(known) - fitted):
+    told["date"] = before.get("date") or date_of(old)
+    new.settings["restarted"] |= {key: value for key, value in told.items() if value}
+    if held := _errors_of_held(old, held):
         missing = {"missing": ["relative", "absolute"]}
         new.fit["model_error"] = (new.fit.get("model_error") or missing) | held
         keep_sky_accuracy(new)

@@ -276,9 +276,9 @@ def rectangles(apertures, shape):
 def measure_internal(cube, good, detector, layout, *, background="none", max_masked=0.2):
     """Measure the beams of an internal source in all slices of a cube (W, Y, X).
 
-    Pixels without a value are left out, and the sum is scaled to the full area. So are single
-    pixels far off their eight neighbours, such as hot ones and those hit by a cosmic ray. The
-    options are described in `reduce_run`.
+    Pixels without a value are left out, and the sum is scaled to that of the whole rectangle. So
+    are single pixels far off their eight neighbours, such as hot ones and those hit by a cosmic
+    ray. The options are described in `reduce_run`.
     """
     check_choice("background", background, ("none", "outside"), ParameterError)
     if not 0 <= max_masked < 1:
@@ -301,12 +301,13 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
             pixels.reshape(len(cube), -1) @ weights.ravel()
             for pixels in (np.where(used, cut, 0.0), used)
         )
-        area = weights.sum()
-        scale = area / np.where(kept > 0, kept, 1.0)
-        result.flux[beam] = total * scale - level * area
-        photons = own.photon_noise(np.maximum(total - level * kept, 0.0)) * scale**2
+        area, net = weights.sum(), total - level * kept
+        scale, error = _to_whole(cut, used, weights, level, np.stack([net, kept]), own)
+        result.flux[beam] = net * scale
+        photons = own.photon_noise(np.maximum(net, 0.0)) * scale**2
         pixel = np.maximum(spread, own.read_noise**2)
         result.variance[beam] = flux_variance(photons, area * scale, pixel, number)
+        result.variance[beam] += (error * result.flux[beam]) ** 2
         result.flag(kept < (1 - max_masked) * area, f"{layout.beams[beam]} aperture masked")
         full = known & (weights > 0) & (cut >= own.saturation)
         result.flag(full.any(axis=(1, 2)), "saturated")
@@ -315,6 +316,60 @@ def measure_internal(cube, good, detector, layout, *, background="none", max_mas
         result.covariance[:] = shared_background(*areas, spread, number)
     result.flag((result.flux <= 0).any(axis=0), "no light")
     return result
+
+
+# what is around a pixel without a value weighs as a Gaussian of so many pixels
+_AROUND = 3.0
+
+
+def _to_whole(cut, used, weights, level, sums, detector):
+    """Return by what sums over the ``used`` pixels become those of a rectangle, and its error.
+
+    Pixels without a value in one slice are as bright as in the others, and those without one in any
+    as a surface of second order and what is around them have it. ``sums`` are of light and area.
+    The error, relative and the same in all slices, is that of such pixels where values are known.
+    """
+    area, (net, kept) = weights.sum(), sums
+    plain, inside = area / np.where(kept > 0, kept, 1.0), weights > 0
+    mean = np.where(kept > 0, net * plain / area, 0.0).clip(0.0)
+    if used[:, inside].all() or not mean.any():
+        return plain, 0.0
+    light = np.einsum("wyx,w->yx", used, mean)
+    dark = np.einsum("wyx,w->yx", used, level)
+    bright = np.sum(cut, axis=0, dtype=float, where=used) - dark
+    seen = inside & (light > 0)
+    pattern = np.divide(bright, light, out=np.zeros(seen.shape), where=seen)
+    lost, error = inside & ~seen, 0.0
+    if lost.any():
+        pattern = _filled(pattern, seen)
+        # the same holes elsewhere, where what they hide is known
+        steps = [(y * h // 3, x * w // 3) for h, w in [lost.shape] for y, x in np.ndindex(3, 3)][1:]
+        holes = [np.roll(light <= 0, step, (0, 1)) & seen for step in steps]
+        sizes = [np.sum(weights * hole) / np.sum(weights * lost) for hole in holes]
+        off = [
+            np.sum(weights * (pattern - _filled(pattern, seen & ~hole))) / size
+            for hole, size in zip(holes, sizes, strict=True)
+            if size > 0.5
+        ]
+        # less the noise of the pixels that are known there
+        noise = detector.variance(mean).sum() / mean.sum() ** 2 * np.sum(weights[lost] ** 2)
+        hidden = (weights * lost).sum()
+        error = np.sqrt(max(np.mean(np.square(off)) - noise, 0.0)) if off else hidden
+    light_of = weights * pattern
+    whole, part = light_of.sum(), used.reshape(len(used), -1) @ light_of.ravel()
+    known = (part > 0) & (whole > 0)
+    return np.where(known, whole / np.where(known, part, 1.0), plain), error / area
+
+
+def _filled(pattern, seen):
+    """Return an image with what a smooth surface and the pixels around say of those not seen."""
+    y, x = np.indices(seen.shape) / np.max(seen.shape)
+    terms = np.stack([np.ones(seen.shape), x, y, x * x, x * y, y * y], axis=-1)
+    surface = terms @ np.linalg.lstsq(terms[seen], pattern[seen])[0]
+    apart = np.where(seen, pattern - surface, 0.0)
+    around, known = (ndimage.gaussian_filter(a, _AROUND) for a in (apart, seen.astype(float)))
+    around = np.divide(around, known, out=np.zeros(seen.shape), where=known > 0)
+    return np.where(seen, pattern, surface + around)
 
 
 def evenly_lit(cube, good, layout):

@@ -266,7 +266,8 @@ def test_restart_frees_what_is_named_and_holds_the_rest(years):
             assert same == (f"{old.name}.{key}" != "derotator.retardance")
     moved = new.chain["derotator"].retardance.value - years[0].chain["derotator"].retardance.value
     assert np.abs(moved - 0.3).max() < 0.1
-    assert new.settings["restarted"] == {"from": content_hash(years[0]), "free": ["derotator"]}
+    told = {"from": content_hash(years[0]), "free": ["derotator"], "date": DATES[0]}
+    assert new.settings["restarted"] == told
     assert not years[0].chain["hwp"].w_sio2.fixed
     assert new.converged
 
@@ -347,6 +348,39 @@ def test_new_star_brings_its_own_parameters(years):
     assert {name.partition("[")[0] for name in new.covariance.names} == {
         "star_HD1.q", "star_HD1.u", "m3.diattenuation", "m3.theta",
     }  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_mirror_that_no_new_frame_saw_is_not_known_as_it_was(years):
+    """Published values took its place, with the errors that the old ones had: off by 30 of them."""
+    stars, meta = FRAMES.copy(), CHARIS.published_meta() | {"yjh50_dichroic": "out"}
+    stars["altitude"] = np.linspace(40, 70, len(stars)) * u.deg
+    stars["parallactic"] = np.linspace(-60, 40, len(stars)) * u.deg
+    stars["hwp_true"] = stars["hwp"] + 0.5 * stars["parallactic"] + stars["altitude"]
+    kind = {"source": "unpolarized standard star"}
+    chains = [
+        make_chain(),
+        CHARIS.chain(*kind.values(), ["nbs"], derotator="linear", wavelength=WAVELENGTH),
+    ]
+    chains[1]["hwp"].theta.fixed = chains[1]["derotator"].theta.fixed = True
+    star = simulate(chains[1], WAVELENGTH, stars, seed=1, meta=meta | kind | {"date": DATES[1]})
+    tables = [observe(2, DATES[1]), star]
+    positions = [CHARIS.positions(*pair) for pair in zip(tables, chains, strict=True)]
+    old = calibrate(chains, tables, positions=positions, instrument="charis", cross_validate=False)
+    new = observe(3, "2025-11-10")
+    how = {"chain": chains, "cross_validate": False}
+    with_star = restart(old, [new, star], ["wollaston"], **how)
+    assert with_star.verdict().usable
+    assert f"of what is held, as of {DATES[1]}" in with_star.verdict().cautions[-1]
+    np.testing.assert_array_equal(
+        with_star.chains[1]["m3"].diattenuation, old.chains[1]["m3"].diattenuation
+    )
+    how["chain"] = make_chain()
+    alone = restart(old, new, ["wollaston"], **how)
+    for one in (alone, restart(alone, observe(4, "2025-11-12"), ["hwp"], **how)):
+        assert one.verdict().reasons[0] == "none of these data saw m3: add the star's table"
+        assert "unknown" in one.verdict().words[1]
+        assert one.settings["restarted"]["date"] == DATES[1]
 
 
 def test_restart_keeps_ties_of_what_is_free(years):

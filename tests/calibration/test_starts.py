@@ -514,6 +514,8 @@ def test_a_sign_that_no_datum_tells_stays_that_of_the_start_and_is_named():
         named = [one for one in cal.identifiability.mirrors if "tell the sign" in one]
         assert any(one.startswith("derotator.retardance at 1043.0 nm") for one in named), seed
         assert f"{len(named)} but for the sign" in cal.summary(), seed
+        # with which the plate is on the other side of half a wave
+        assert np.all(cal.parameter_values()["hwp.retardance"]["std"] > 3), seed
         # the other sign moves q and u by 0.4 %, as probably as not; without it 0.08 % is claimed
         (claim,) = target_accuracies(cal, [(22 * u.percent, None)])
         assert 0.15 * u.percent < claim["s_Q"][0] < 0.4 * u.percent

@@ -337,12 +337,14 @@ def undecided_signs(measurement, view, stds, minima, lawful=()):
     better. Phases that fit exactly as well are a mirror solution anyway; what is zero within three
     of its ``stds`` has no sign. With them the mean squares of the errors of q and u that the other
     signs would be on sky, times their probabilities: in proportion to the polarization and apart
-    from it, (2, n_wavelengths); zero where the phases beside tell the sign. What is
-    ``lawful`` stays as it is.
+    from it, (2, n_wavelengths); zero where the phases beside tell the sign. And the roots of those
+    of parameters, in their units by name, where these are longer than ``stds``, but for what has
+    the other sign. What is ``lawful`` stays as it is.
     """
     problem = BinProblem(measurement, measurement.weighting)
     kept = [row for row, slot in enumerate(problem.slots) if slot.name in lawful]
     vector, found, errors = measurement.vector(), [], np.zeros((2, problem.n_bins))
+    away = np.zeros(vector.size)
     costs, total = problem.polish(vector, kept=kept)[1], np.sum(problem.residuals(vector) ** 2)
     # no more degrees of freedom than are left
     whole = max(measurement.n_data - measurement.free.size, 1)
@@ -383,11 +385,22 @@ def undecided_signs(measurement, view, stds, minima, lawful=()):
         shares = [(chance[i], one) for i, one in others.items()]
         chance[[*others]] = 0.0
         for share, there in ((chance, trial), *shares):
+            near = there.copy()
+            for own in phases:
+                near = problem.turned(near, problem.elements[own], vector[problem.elements[own]])
+            # what is known but for its sign is named
+            near[places] = vector[places]
+            weight = np.full(vector.size, np.max(share))
+            weight[problem.elements] = share
+            away = np.maximum(away, np.sqrt(weight) * np.abs(near - vector))
             if view is not None and np.any(share > 0):
                 other = seen_with(view, measurement.put_back(there))
                 errors = np.maximum(errors, share * mean_errors(view, other))
-    elsewhere, further = _elsewhere(measurement, view, stds, minima)
-    return found + elsewhere, np.maximum(errors, further)
+    elsewhere, further, farther = _elsewhere(measurement, view, stds, minima)
+    free, away = measurement.free, np.maximum(away, farther)
+    far = zip(free.names, away / free.factors(), away > stds, strict=True)
+    longer = {name: float(error) for name, error, is_longer in far if is_longer}
+    return found + elsewhere, np.maximum(errors, further), longer
 
 
 def _elsewhere(measurement, view, stds, minima):
@@ -405,6 +418,7 @@ def _elsewhere(measurement, view, stds, minima):
     # what is held, or open, is no way to another
     np.divide(1, stds, out=inverse, where=stds > 0)
     seen, found, errors = [problem.solution], [], np.zeros((2, measurement.wavelength.size))
+    away = np.zeros(free.size)
     total = np.sum((counts * problem.residuals(seen[0])) ** 2)
     for there in minima if total > 0 else ():
         ratio = np.sum((counts * problem.residuals(there)) ** 2) / total
@@ -420,10 +434,12 @@ def _elsewhere(measurement, view, stds, minima):
             f"{ratio:.2f} times as large: the data do not tell which is true"
         )
         found.append({"words": words, "sky": None})
+        chance = 1 / (1 + np.exp(lost / 2))
+        away = np.maximum(away, np.sqrt(chance) * np.abs(there - seen[0]))
         if view is not None:
             other = mean_errors(view, seen_with(view, measurement.put_back(there)))
-            errors = np.maximum(errors, other / (1 + np.exp(lost / 2)))
-    return found, errors
+            errors = np.maximum(errors, other * chance)
+    return found, errors, away
 
 
 def _refitted(problem, vector, costs, trial, new):

@@ -525,7 +525,7 @@ def _result(fitted, covariance=None):
         own, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own, white)
     stds = own.stds * measurement.free.factors()
     others = fit.pop("others", ()), fitted.lawful
-    signs, errors_of_signs = undecided_signs(measurement, view, stds, *others)
+    signs, errors_of_signs, fit["elsewhere"] = undecided_signs(measurement, view, stds, *others)
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting
@@ -607,7 +607,8 @@ def _beside_lamp(measurement, whitened, covariance, white):
     rows, priors = problem.jacobian(vector) * whitened.scale, np.zeros(measurement.n_priors)
     pull = np.concatenate([measurement.of_lamp(vector) * problem.weights, priors])
     step, moved = _moved_by(whitened, rows, pull, covariance, measurement)
-    if moved["errors"] > _LITTLE and not white:
+    moved["counts"] = moved["errors"] > _LITTLE
+    if moved["counts"] and not white:
         covariance = covariance.beside(np.where(covariance.stds > 0, step, 0.0)[None])
     return covariance, moved
 

@@ -324,7 +324,7 @@ class Calibration:
         stds, flags = self.covariance.stds, self.identifiability.identifiable
         bound, found = set(self.at_bound), self.fit.get("bounds") or {}
         inward, released = found.get("inward", {}), found.get("released", {})
-        known = {}
+        known, elsewhere = {}, self.fit.get("elsewhere") or {}
         for i, name in enumerate(self.covariance.names):
             more = released.get(name, {"without": np.nan, "slack": 0.0, "by": []})
             # the error with all bounds as exact, as independent data have it, and with none
@@ -332,7 +332,8 @@ class Calibration:
             exact = np.sqrt(max(stds[i] ** 2 - slack**2, 0.0))
             beyond = np.hypot(exact, more["without"])
             beside = (inward.get(name, np.nan), ", ".join(more["by"]), beyond)
-            known[name] = (stds[i], bool(flags[i]), name in bound, *beside)
+            std = np.hypot(stds[i], elsewhere.get(name, 0.0))
+            known[name] = (std, bool(flags[i]), name in bound, *beside)
         return known
 
     @property

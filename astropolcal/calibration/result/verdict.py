@@ -109,7 +109,7 @@ def verdict(calibration, targets=TARGETS):
     unseen = [] if bright else ["Q and U on sky are unknown: the frames do not measure them"]
     on_sky = [_open_words(sky), *_too_far(bright, sky)], unseen
     reasons, wrong = _reasons(calibration, known, free, on_sky)
-    held = calibration.settings.get("restarted", {}).get("open")
+    before = calibration.settings.get("restarted", {})
     cautions = []
     if not reasons:
         excess = _excess(calibration)
@@ -121,8 +121,9 @@ def verdict(calibration, targets=TARGETS):
         off = calibration.fit.get("off_minimum") or {"errors": 0.0}
         if off["errors"] > _OFF:
             cautions.append(f"{off['parameter']} is {off['errors']:.2g} errors off the minimum")
-        if "restarted" in calibration.settings:
-            cautions.append("errors of parameters lack those of what is held")
+        if before:
+            of = f", as of {str(before['date'])[:10]}" if before.get("date") else ""
+            cautions.append(f"errors of parameters lack those of what is held{of}")
         cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
         cautions += [*_few(calibration), *_of_lamp(calibration)]
         # a fit minds the bounds of what leads only
@@ -137,7 +138,7 @@ def verdict(calibration, targets=TARGETS):
     advice = _next(calibration, free, wrong, sky)
     words = [
         _first(reasons, cautions),
-        _UNKNOWN_ON_SKY if wrong or held else _accuracy(tables, sky),
+        _UNKNOWN_ON_SKY if wrong or {*before} & {"open", "lost"} else _accuracy(tables, sky),
         *_determined(calibration, free),
         f"Next        {advice}",
     ]
@@ -168,8 +169,10 @@ def _reasons(calibration, known, free, on_sky=((), ())):
     laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
     usual = {name: entry for name, entry in free.items() if name not in laws}
     unknown = [*_absurd(usual), *on_sky[0], _hanging(free)]
-    held = calibration.settings.get("restarted", {}).get("open")
-    unknown += [f"held, and open in the calibration before: {', '.join(held)}"] if held else []
+    before, words = calibration.settings.get("restarted", {}), "held, and open in the calibration"
+    unknown += [f"{words} before: {', '.join(before['open'])}"] if "open" in before else []
+    if "lost" in before:
+        unknown.append(f"none of these data saw {', '.join(before['lost'])}: add the star's table")
     unknown += on_sky[1]
     stuck, arrived = _stuck(free), "" if calibration.converged else "the fit did not converge"
     reasons = [words for words in (*wrong, *unknown, stuck, arrived) if words]
@@ -211,8 +214,8 @@ def _carried_off(calibration):
 
 def _of_lamp(calibration):
     """Name the parameter that the brightness of frames moves by more than its other errors."""
-    moved = calibration.fit.get("lamp_moves") or {"errors": 0.0}
-    if not moved["errors"] > 1:
+    moved = calibration.fit.get("lamp_moves") or {}
+    if not moved.get("counts"):
         return []
     counted = "not" if calibration.settings["errors"] == "white" else "now"
     return [
