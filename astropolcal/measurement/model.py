@@ -27,6 +27,9 @@ __all__ = ["Measurement"]
 
 # what changes the brightness of frames by less than a hundredth of what changes it most, squared
 _SEEN = 1e-4
+# within so many of its errors a parameter may explain it: with one a true diattenuation of 30 % did
+# not in 3 of 10 runs, with six one of 2 % explained a lamp that flickers
+_ROOM = 3.0
 
 
 class Measurement(ScalarParameters):
@@ -279,11 +282,11 @@ class Measurement(ScalarParameters):
         parts = [d.values(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def of_lamp(self, vector):
+    def of_lamp(self, vector, errors):
         """Return what all predicted data gain by the brightness of each frame, (n_data,).
 
-        By what no free parameter explains of it: how bright frames are tells more of some, such as
-        a diattenuation, than the data do.
+        By what no free parameter explains of it, as far as its errors, (n_free,), canonical, allow:
+        how bright frames are tells more of some, such as a diattenuation, than the data do.
         """
         if self.observable.name == "intensity":
             # in which the brightness is free anyway
@@ -291,8 +294,11 @@ class Measurement(ScalarParameters):
         sweeps = self._sweeps(vector)
         parts = [d.brightness(s) for d, s in zip(self.datasets, sweeps, strict=True)]
         bright, slopes = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-        slopes *= self.free.steps[:, None]
+        slopes *= np.where(errors > 0, self.free.steps, 0.0)[:, None]
+        room = _ROOM * errors
+        held = np.divide(self.free.steps, room, out=np.zeros(room.size), where=room > 0)
         square = np.einsum("kfd,kgd->fg", slopes, slopes, optimize=True)
+        square += np.diag(np.mean((bright - 1) ** 2) * held**2)
         step = np.linalg.lstsq(square, np.einsum("kfd,kd->f", slopes, bright), rcond=_SEEN)[0]
         bright = bright - np.einsum("kfd,f->kd", slopes, step)
         ends = np.cumsum([d.n_data for d in self.datasets])[:-1]

@@ -605,7 +605,8 @@ def _beside_lamp(measurement, whitened, covariance, white):
     """
     problem, vector = Problem(measurement, measurement.weighting), measurement.vector()
     rows, priors = problem.jacobian(vector) * whitened.scale, np.zeros(measurement.n_priors)
-    pull = np.concatenate([measurement.of_lamp(vector) * problem.weights, priors])
+    lamp = measurement.of_lamp(vector, covariance.stds * measurement.free.factors())
+    pull = np.concatenate([lamp * problem.weights, priors])
     step, moved = _moved_by(whitened, rows, pull, covariance, measurement)
     moved["counts"] = moved["errors"] > _LITTLE
     if moved["counts"] and not white:
