@@ -124,7 +124,7 @@ def verdict(calibration, targets=TARGETS):
         if "restarted" in calibration.settings:
             cautions.append("errors of parameters lack those of what is held")
         cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
-        cautions += [*_few(calibration), *_of_lamp(calibration)]
+        cautions += [*_few(calibration), *_of_lamp(calibration), *_badly_predicted(calibration)]
         # a fit minds the bounds of what leads only
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
@@ -318,6 +318,15 @@ def _elsewhere(calibration):
     names = dict.fromkeys(one[0] for one in told if len(one) > 1)
     if names:
         yield f"another minimum fits nearly as well, with another {listed(names, 'or', 2)}"
+
+
+def _badly_predicted(calibration):
+    """Say which data that no fit saw are farther off than left-out frames of their source."""
+    sources = {record.source for record in calibration.datasets}
+    for one in calibration.fit.get("standards") or []:
+        times = median_of_known(one["chi"]) if one["source"] in sources else np.nan
+        if times > _CLEARLY:
+            yield f"{one['name']} is {times:.2g} times farther off than left-out frames"
 
 
 def _apart(calibration):
