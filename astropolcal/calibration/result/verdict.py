@@ -326,7 +326,7 @@ def _badly_predicted(calibration):
     for one in calibration.fit.get("standards") or []:
         times = median_of_known(one["chi"]) if one["source"] in sources else np.nan
         if times > _CLEARLY:
-            yield f"{one['name']} is {times:.2g} times farther off than left-out frames"
+            yield f"{one['name']} is {times:.2g} times as far off as left-out frames"
 
 
 def _apart(calibration):
