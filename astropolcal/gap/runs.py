@@ -13,7 +13,7 @@ import numpy as np
 
 from astropolcal.chain import leaves
 from astropolcal.exceptions import GapError
-from astropolcal.gap._words import ONE, decimals
+from astropolcal.gap._words import ONE, decimals, others
 from astropolcal.gap.cells import Cell, count_runs
 from astropolcal.optics.perturbations import split_run
 from astropolcal.words import listed
@@ -82,7 +82,9 @@ def changes(diagnosis, causes):
             # of two runs, the opposite of the other one is the same change
             twins = (a for a in beside if _in_any_run(Cell(**a["cell"])) == _in_any_run(cell))
             told = cause["share"] + sum(a["probability"] for a in twins) >= ONE
+            like = [] if told else others(cause, {})[:1]
             of = "" if told else " of this or what looks the same"
+            of += "".join(f", such as {words}" for words in like)
             # what has a name of its own in each run
             is_named = str(cause.get("effect")).endswith(f"/dataset:{run}")
             named = cause["title"].removesuffix(f' in "{run}"') if is_named else ""

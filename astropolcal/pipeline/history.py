@@ -3,7 +3,8 @@
 Calibrations over the years: parameters against date, what changed, and how surely.
 
 A difference between calibrations is judged in the directions that the data of all of them
-determine, without priors, which stay alike when something changes, with each full covariance.
+determine, without priors, which stay alike when something changes, with each full covariance,
+wider where its errors rest on few settings.
 Calibrations that share data are refused, because their errors are not independent. `restart` refits
 what changed since a calibration, and holds the rest; as the errors of the rest are not in its own,
 there is a warning where it is compared.
@@ -26,6 +27,7 @@ from astropy.time import Time
 from astropolcal.calibration.fit.calibrate import calibrate
 from astropolcal.calibration.fit.run_model import Model
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
+from astropolcal.calibration.noise.scatter import by_chance
 from astropolcal.calibration.system import free_of, split_chain
 from astropolcal.calibration.uncertainty.covariance import Covariance, full_covariance
 from astropolcal.calibration.validation.targets import keep_sky_accuracy, target_accuracies
@@ -315,8 +317,11 @@ def compared(named, parameters=None):
     apart = [(own - values[0]) / steps for own in values]
     # on the way what is open turns to that of the first: half of its turn counts
     values = [(basis + lead) / 2 @ own for lead, own in zip(leads, apart, strict=True)]
+    told = [(one.fit.get("model_error") or {}).get("settings") for _, one in named]
+    # settings that err in one of them do so in all
+    luck = by_chance(min(filter(None, told), default=None))
     known = [
-        (a.known * a.sigmas[:, None])[:, p] @ lead.T
+        luck * (a.known * a.sigmas[:, None])[:, p] @ lead.T
         for a, p, lead in zip(axes, places, leads, strict=True)
     ]
     kept, deviations, weights = about_the_mean(values, [k.T @ k for k in known])
@@ -540,7 +545,7 @@ def courses(calibrations, parameters=None, *, events=()):
     found, rows, spans = compared(named, parameters), [], []
     if found.slopes.size:
         # something is determined in all of them
-        model = Model(_Standing(found, [one for _, one in named]), (), dates, events)
+        model = Model(_Standing(found, named[0][1]), (), dates, events)
         model.search()
         rows, spans = model.courses()
     table, names = Table(rows=rows), [name for name, _ in named]
@@ -552,9 +557,8 @@ def courses(calibrations, parameters=None, *, events=()):
 class _Standing:
     """Calibrations as runs of which the rows stay, in what all of them determine."""
 
-    def __init__(self, found, calibrations):
-        known = calibrations[0].covariance
-        units = dict(zip(known.names, known.units, strict=True))
+    def __init__(self, found, first):
+        units = dict(zip(first.covariance.names, first.covariance.units, strict=True))
         steps = np.array([declared_step(units[name]) for name in found.names])
         size, count = len(found.names), len(found.weights)
         free = SimpleNamespace(
@@ -565,12 +569,12 @@ class _Standing:
             prior_residuals=lambda vector: np.empty(0),
         )
         self.shapes, self.alone = [SimpleNamespace(free=free)] * count, [np.zeros(size)] * count
-        told = [(one.fit.get("model_error") or {}).get("settings") for one in calibrations]
         self.rows = []
-        for weight, off, settings in zip(found.weights, found.deviations, told, strict=True):
+        for weight, off in zip(found.weights, found.deviations, strict=True):
             root = np.linalg.cholesky(weight).T
             rows, targets = root @ found.slopes * steps, root @ off
-            one = SimpleNamespace(rows=rows, targets=targets, chi2=0.0, settings=settings)
+            # the weights know on how few settings they rest
+            one = SimpleNamespace(rows=rows, targets=targets, chi2=0.0, settings=None)
             self.rows.append(one)
 
     def around(self, vectors):

@@ -251,6 +251,16 @@ def test_standards_are_kept_with_the_calibration(make, fresh, chain, standard):
     np.testing.assert_allclose(percent(fresh.accuracy["s_standard"]), np.sqrt(squares / n))
 
 
+def test_a_changed_optic_that_a_standard_shows_is_a_caution(make, fresh, chain, standard):
+    add_standard(fresh, chain, standard)
+    assert not any("left-out frames" in words for words in fresh.verdict().cautions)
+    changed = make.observe(turned(chain), wavelength=LAM, seed=9, meta=META, name="later")
+    times = np.median(add_standard(fresh, chain, changed)["chi"])
+    words = f"later is {times:.2g} times as far off as left-out frames"
+    assert times > 5
+    assert words in fresh.verdict().cautions, fresh.verdict()
+
+
 def test_a_standard_of_another_source_is_not_that_of_the_dataset(make, fresh, chain):
     data = make.observe(chain, wavelength=LAM, seed=9, meta={"source": "unpolarized"}, name="dark")
     table = add_standard(fresh, chain, data)

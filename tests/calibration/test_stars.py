@@ -134,9 +134,25 @@ def test_an_angle_that_moved_between_lamp_and_star_is_named_and_counts_in_the_er
         if move:
             assert found[0]["parameter"] == "derotator.theta"
             assert abs(found[0]["change_deg"] - move) < 3 * found[0]["std_deg"]
-            assert "derotator.theta differs in star by" in told.words[0]
-            assert told.advice.endswith("--own derotator.theta gives each its own")
+            # the circular retardance of the derotator turns polarization as well
+            assert "derotator.theta or derotator.circular differs in star by" in told.words[0]
+            named = "did derotator.theta or derotator.circular move between datasets? --own with"
+            assert told.advice.endswith(f"{named} the one that did gives each its own")
     assert errors[1] > 5 * errors[0], errors
+
+
+def test_a_plate_that_turned_is_named_beside_the_polarizer_that_it_looks_like():
+    chain = CHARIS.chain("polarized", derotator="linear", wavelength=CHARIS.wavelength[[2, 11, 20]])
+    frames = half_wave_plate_cycles(derotator=np.linspace(45, 122, 8) * u.deg)
+    for optic in ("hwp", "calibration_polarizer"):
+        runs, second = [], chain.copy()
+        second[optic].theta.value += 0.3
+        for seed, true in enumerate((chain, second)):
+            run = simulate(true, CHARIS.wavelength[[2, 11, 20]], frames, seed=seed, name=f"r{seed}")
+            runs.append(run)
+        told = calibrate([chain, chain], runs, search=False, cross_validate=False).verdict()
+        for name in ("hwp.theta", "calibration_polarizer.theta"):
+            assert name in told.advice, optic
 
 
 def test_chain_without_a_star_is_an_error(simulated):

@@ -79,14 +79,20 @@ def test_a_fault_of_one_of_two_runs_at_other_wavelengths():
 
 @pytest.mark.slow
 def test_a_stage_with_another_zero_is_one_change():
-    second = data.chain()
-    second["hwp"].theta = second["hwp"].theta.quantity + 0.4 * u.deg
-    runs = [data.observed(data.chain(), seed=3, name=JULY), data.observed(second, name=OCTOBER)]
-    found = diagnose(data.chain(), runs, changes=True)
-    assert [cause.name for cause in found.causes] == [f"hwp_zero/dataset:{OCTOBER}"]
-    (change,) = to_dict(found)["changes"]
-    assert "the zero of the angle of the half-wave plate changed by 0.4" in change["words"]
-    assert change["cell"]["place"] == "in:hwp"
+    for role, optic, flux in (("hwp", "hwp", 1e6), ("polarizer", "calibration_polarizer", 1e8)):
+        second = data.chain()
+        second[optic].theta = second[optic].theta.quantity + 0.4 * u.deg
+        runs = [
+            data.observed(true, seed=i, name=name, flux=flux)
+            for i, (true, name) in enumerate([(data.chain(), JULY), (second, OCTOBER)])
+        ]
+        found = diagnose(data.chain(), runs, changes=True)
+        assert [cause.name for cause in found.causes] == [f"{role}_zero/dataset:{OCTOBER}"]
+        (change,) = to_dict(found)["changes"]
+        name = {"hwp": "half-wave plate", "polarizer": "calibration polarizer"}[role]
+        assert f"the zero of the angle of the {name} changed by 0." in change["words"]
+        (size,) = change["size"].values()
+        assert np.allclose(size["value"], 0.4, atol=0.02)
 
 
 @pytest.mark.slow
@@ -145,18 +151,24 @@ def test_a_change_is_found_with_its_run_cell_and_size():
 
 @pytest.mark.slow
 def test_a_change_that_others_look_like_is_not_told_as_sure():
-    turned = ("source", "rotation", "constant", np.deg2rad(0.5))
+    turned = ("source", "rotation", "constant", np.deg2rad(0.1))
     content = to_dict(diagnose(data.chain(), pair([], [turned]), changes=True))
     (change,) = content["changes"]
-    assert change["words"].endswith("(probability 99 % of this or what looks the same).")
+    named = [
+        name for name in ("half-wave plate", "calibration polarizer") if name in change["words"]
+    ]
+    assert len(named) == 2
+    assert "(probability 99 % of this or what looks the same, such as zero of" in change["words"]
 
 
 def test_which_of_three_runs_changed_is_not_told_as_sure_where_two_may_have():
     cell = {"place": "after:derotator", "kind": "retardance_d", "dependence": "dataset:a"}
-    alias = {"cell": cell | {"dependence": "dataset:b"}, "probability": 0.48}
-    cause = {"cell": cell, "share": 0.5, "aliases": [alias], "size": {}}
-    cause |= {"probability": 0.97, "significance": 5.0}
-    for names, end in (("ab", "97 %)."), ("abc", "97 % of this or what looks the same).")):
+    alias = {"cell": cell | {"dependence": "dataset:b"}, "probability": 0.48, "effect": None}
+    alias |= {"name": "after:derotator/retardance_d/dataset:b", "title": "that of b"}
+    cause = alias | {"cell": cell, "share": 0.5, "aliases": [alias], "size": {}}
+    cause |= {"name": alias["name"][:-1] + "a", "probability": 0.97, "significance": 5.0}
+    like = "97 % of this or what looks the same, such as that of b (48 %))."
+    for names, end in (("ab", "97 %)."), ("abc", like)):
         model = data.fitted([data.observed(name=name) for name in names])
         (change,) = changes(SimpleNamespace(improved=model), [cause])
         assert change["words"].endswith(end)

@@ -25,6 +25,7 @@ from astropolcal.calibration.fit.evidence import (
     weigh,
 )
 from astropolcal.calibration.identifiability.linearized import STILL, decompose, orthonormal
+from astropolcal.calibration.noise.scatter import by_chance
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement.parameters import is_of, optic, stem
 from astropolcal.progress import stage
@@ -44,10 +45,6 @@ _CHANGED, _MOST_CHANGED = 0.3, 0.05
 _ARRIVED, _MOST_ROUNDS, _HALVINGS, _SHORTER = 0.01, 20, 6, 1.1
 # so far beyond a bound, in steps of a degree or so, is rounding
 _BEYOND = 1e-9
-# errors that rest on n settings, of the derotator for example, are by chance too small where a run
-# seems to differ: their variance counts 1 + 8/n times there. Of 68 series of 7 equal runs with 4 to
-# 14 settings, and hidden errors of these or of frames, 24 were said to change without it, and 4 are
-_BY_CHANCE = 8.0
 _PINV = 1e-9
 # rows of so many runs are reduced at a time
 _MANY = 2000
@@ -89,8 +86,7 @@ class Model:
         #: Rows around the parameters of each run alone, with its residuals there.
         self.alone = self.rows = work.around(self.vectors)
         self.value = self._solved()[0]
-        settings = [one.settings for one in self.alone if one.settings]
-        self.luck = np.sqrt(1 + _BY_CHANCE / min(settings)) if settings else 1.0
+        self.luck = max(by_chance(one.settings) for one in self.alone)
 
     @property
     def varying(self):

@@ -9,7 +9,7 @@ import numpy as np
 
 from astropolcal.calibration.identifiability.sky import chain_from_sky, known_instrument
 from astropolcal.calibration.noise.scatter import kind_of_source
-from astropolcal.calibration.uncertainty.covariance import STATUSES
+from astropolcal.calibration.uncertainty.covariance import APART, STATUSES
 from astropolcal.calibration.uncertainty.derived import mirror_names, mirror_values
 from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
@@ -125,12 +125,16 @@ def verdict(calibration, targets=TARGETS):
             of = f", as of {str(before['date'])[:10]}" if before.get("date") else ""
             cautions.append(f"errors of parameters lack those of what is held{of}")
         cautions += [*_of_one_table(calibration), *_elsewhere(calibration)]
-        cautions += [*_few(calibration), *_of_lamp(calibration)]
+        cautions += [*_few(calibration), *_of_lamp(calibration), *_badly_predicted(calibration)]
         # a fit minds the bounds of what leads only
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
-        cautions += _apart(calibration)
+        if apart := _apart(calibration):
+            moves = listed([f"{one['change_deg']:+.2g}" for one in apart], "or")
+            which = f"{listed([one['parameter'] for one in apart], 'or')} differs"
+            which += f" in {apart[0]['dataset']} by {moves} deg"
+            cautions.append(f"{which} ({apart[0]['sigma']:.0f} sigma)")
         if disagrees_with_priors(calibration):
             told = calibration.fit.get("against_prior")
             which = f": {told['parameter']} by {told['sigma']:.0f} sigma" if told else ""
@@ -319,10 +323,21 @@ def _elsewhere(calibration):
         yield f"another minimum fits nearly as well, with another {listed(names, 'or', 2)}"
 
 
+def _badly_predicted(calibration):
+    """Say which data that no fit saw are farther off than left-out frames of their source."""
+    sources = {record.source for record in calibration.datasets}
+    for one in calibration.fit.get("standards") or []:
+        times = median_of_known(one["chi"]) if one["source"] in sources else np.nan
+        if times > _CLEARLY:
+            yield f"{one['name']} is {times:.2g} times as far off as left-out frames"
+
+
 def _apart(calibration):
-    """Name the angle in which a dataset differs from the others most surely."""
-    words = "{parameter} differs in {dataset} by {change_deg:+.2g} deg ({sigma:.0f} sigma)"
-    return [words.format(**one) for one in (calibration.fit.get("disagreements") or [])[:1]]
+    """Return the entries of the angle in which a dataset differs most surely, and of its rivals."""
+    found = calibration.fit.get("disagreements") or []
+    # which angle it is, is told as surely as that there is a difference
+    least = found[0]["sigma"] ** 2 - APART**2 if found else 0.0
+    return [o for o in found if o["dataset"] == found[0]["dataset"] and o["sigma"] ** 2 > least]
 
 
 def _few(calibration):
@@ -494,8 +509,9 @@ def _next(calibration, free, wrong, sky):
     telescope = "counts as published, without error" if published else "is not in the model"
     unknown = any(_absurd(free)) or bool(sky)
     at_odds = calibration.fit.get("outliers") and calibration.settings.get("loss") == "linear"
-    differs = (calibration.fit.get("disagreements") or [{}])[0].get("parameter", "")
-    apart = differs and f"did {differs} move between datasets? --own {differs} gives each its own"
+    if apart := [one["parameter"] for one in _apart(calibration)]:
+        own = apart[0] if len(apart) == 1 else "with the one that did"
+        apart = f"did {listed(apart, 'or')} move between datasets? --own {own} gives each its own"
     mask = "the frames at odds: mask them (mask_reason), or --loss bisquare"
     advice = (
         (_carried_off(calibration), mask),

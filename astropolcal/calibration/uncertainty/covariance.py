@@ -43,7 +43,7 @@ _NORMAL, _NO_MATTER = (0.975, 1.96), 1.05
 # a robust loss makes no direction softer than this
 _STIFF = 0.05
 # how sure a difference is, and how well a dataset alone has to know an angle, in degree
-_APART, _TOLD = 4.0, 5.0
+APART, _TOLD = 4.0, 5.0
 # what changes the data less, per degree in units of their noise, or is left of it, is nothing
 _SEEN = 1e-6
 
@@ -515,7 +515,7 @@ def disagreements(measurement, whitened, weighting, scatter):
             scattered = scatter.middle(left[:, None])[0, 0] + level**2 * (lost @ lost)
             variance = max(variance, scattered)
         change, std = own @ residuals / size, np.sqrt(variance) / size
-        if abs(change) > _APART * std and std < _TOLD:
+        if abs(change) > APART * std and std < _TOLD:
             one = {"parameter": slot.name, "dataset": names[i], "change_deg": float(change)}
             found.append(one | {"std_deg": float(std), "sigma": float(abs(change) / std)})
     return sorted(found, key=lambda one: -one["sigma"])

@@ -29,6 +29,7 @@ _DEROTATOR = Where("in", "derotator", True, said="derotator")
 _RELAY = Where("after", "relay", True, said="relay downstream of the derotator")
 _STATIC = Where("after", "turning", True, said=_RELAY.said)
 _POLARIZER = Where("after", "polarizer", True, said="calibration polarizer")
+_MOUNT = Where("in", "polarizer", True, in_front=True, said=_POLARIZER.said)
 _MIRROR = Where("after", "mirror", True, said="mirror upstream of the half-wave plate")
 _SPLITTER = Where("before", "splitter", True)
 _DETECTOR = Where("detector")
@@ -467,7 +468,7 @@ LIBRARY = (
 OF_RUNS = [
     _angle_off(f"{name}_zero", place, "zero of the angle", OWN_RUN,
         "all frames of one run, as an offset of the {}")
-    for name, place in _STAGES.items()
+    for name, place in (_STAGES | {"polarizer": _MOUNT}).items()
 ]  # fmt: skip
 # of any axis, which is one optic and two or three cells
 OF_RUNS += [
