@@ -83,7 +83,8 @@ def changes(diagnosis, causes):
             twins = (a for a in beside if _in_any_run(Cell(**a["cell"])) == _in_any_run(cell))
             told = cause["share"] + sum(a["probability"] for a in twins) >= ONE
             # of what is hardly probable itself, what looks the same is of no interest
-            like = others(cause, {})[: cause["probability"] >= _LIKELY and not told]
+            is_asked = cause["probability"] >= _LIKELY and not told
+            like = others(cause, {})[:1] if is_asked else []
             of = "" if told else " of this or what looks the same"
             of += "".join(f", such as {words}" for words in like)
             # what has a name of its own in each run

@@ -125,11 +125,11 @@ def test_chi_square_is_that_of_the_difference(years):
     names = found.parameters
     places = [c.covariance.names.index(n) for c in years[:1] for n in names]
     values = [np.array([_value(c, n) for n in names]) for c in years[:2]]
-    # of errors that rest on the four angles of the derotator
-    wide = [1 + 8 / c.fit["model_error"].get("settings", np.inf) for c in years[:2]]
-    assert max(wide) == 3
+    # of errors that rest on the four angles of the derotator, in one of them and so in both
+    settings = [c.fit["model_error"].get("settings", np.inf) for c in years[:2]]
+    assert min(settings) == 4
     own = (c.covariance.matrix[np.ix_(places, places)] for c in years[:2])
-    total = sum(w * matrix for w, matrix in zip(wide, own, strict=True))
+    total = (1 + 8 / 4) * sum(own)
     difference = values[1] - values[0]
     assert found.chi2 == pytest.approx(difference @ np.linalg.solve(total, difference), rel=1e-6)
     assert found.dof == len(names) == 5
@@ -145,7 +145,7 @@ def test_three_together_are_tested_for_one_value(years):
     found = significance(years, ["wollaston"])
     assert found.dof == 3 * 2
     assert found.sigma < 3.5
-    assert significance(years, ["derotator"]).sigma > 15
+    assert significance(years, ["derotator"]).sigma > 10
 
 
 def equal_runs(seed):
