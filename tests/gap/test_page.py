@@ -198,7 +198,9 @@ def test_page_of_the_health_fits_a_telephone_a_tablet_and_a_desktop(browser, pag
         "next": ["The next calibration is due by 2027-01-01."],
         "events": [{"words": f"{'a long reason ' * 20}on 2026-01-01"}],
         "left_out": ["of_another_mode.asdf"],
-        "courses": [course | {"what": "calibration_polarizer.theta", "course": "steps"}],
+        "courses": [
+            course | {"what": "calibration_polarizer.theta", "course": "steps", "or": ["hwp.theta"]}
+        ],
         "calibrations": [
             {"date": "2026-01-01", "name": f"{'long_' * 20}name.asdf", "converged": True}
             | {"s_cv_percent": 0.123, "s_res_percent": None}
