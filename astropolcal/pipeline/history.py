@@ -498,7 +498,8 @@ def courses(calibrations, parameters=None, *, events=()):
         what varies, or that it is constant; that of each course, beside all others; ``when``,
         between which calibrations it changed (95 %); ``or``, what would explain them nearly as well
         in its place. ``meta["calibrations"]`` and ``meta["dates"]`` name the runs,
-        ``meta["steps"]`` those before and after each step, row by row, and ``meta["n_open"]`` is
+        ``meta["steps"]`` those before and after each step, row by row, with its probability and
+        what may be in its place, and ``meta["n_open"]`` is
         the number of directions that one of the calibrations does not determine; they take no part.
 
     Raises
@@ -550,7 +551,9 @@ def courses(calibrations, parameters=None, *, events=()):
         rows, spans = model.courses()
     table, names = Table(rows=rows), [name for name, _ in named]
     table.meta |= {"calibrations": names, "dates": dates.isot.tolist(), "n_open": found.n_open}
-    table.meta["steps"] = [[(names[a], names[b + 1]) for a, b in own] for own in spans]
+    table.meta["steps"] = [
+        [(names[a], names[b + 1], *told) for a, b, *told in own] for own in spans
+    ]
     return table
 
 

@@ -157,10 +157,13 @@ def _group(entries, rows, moment, goal, limit, events):
             continue
         rivals = [one for one in row["or"].split(", ") if one]
         known = {"what": what, "or": rivals, "course": course}
-        told, surely = listed([what, *rivals], "or"), 1 - row["constant"]
+        told = listed([what, *rivals], "or")
         words = f"{told} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
         content["courses"].append(known | {name: row[name] for name in COURSES} | {"words": words})
-        for before, after in steps if surely >= LIKELY else ():
+        for before, after, surely, others in steps:
+            if surely < LIKELY:
+                continue
+            told = listed([what, *others], "or")
             days = [_start(e)[:10] for e in dated if e.name in (before, after)]
             words = f"{told} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
             one = {"what": told, "before": before, "after": after, "from": days[0], "to": days[1]}

@@ -383,9 +383,10 @@ class Model:
         return found[term.what], rivals, float(1 / (1 + weights.sum()))
 
     def courses(self):
-        """Return what each optic does, a row each, and the gaps in which each of its steps is.
+        """Return what each optic does, a row each, and of each of its steps first and last gap.
 
-        See `astropolcal.calibration.fit.runs.RunsCalibration`.
+        See `astropolcal.calibration.fit.runs.RunsCalibration`; with the probability of the step,
+        and its rivals.
         """
         own, rows, spans, days = {}, [], [], sorted(self.dates.isot)
         for term in self.terms:
@@ -395,11 +396,19 @@ class Model:
             # of several steps the last one is judged
             told, rivals, share = judged[-1]
             pairs = zip(terms, judged, strict=True)
-            spans.append(sorted(one.span() for term, (one, *_) in pairs if term.gap is not None))
+            spans.append(
+                sorted(
+                    (*one.span(), 1 - one.chances["constant"], others)
+                    for term, (one, others, _) in pairs
+                    if term.gap is not None
+                )
+            )
             row = {"what": what, "course": terms[-1].course}
             row["probability"] = (1 - told.chances["constant"]) * share
             row |= told.chances
-            row["when"] = ", ".join(f"{days[a][:10]} to {days[b + 1][:10]}" for a, b in spans[-1])
+            row["when"] = ", ".join(
+                f"{days[a][:10]} to {days[b + 1][:10]}" for a, b, *_ in spans[-1]
+            )
             rows.append(row | {"or": ", ".join(rivals)})
         for what, told in self.weighed().items():
             if what == optic(what) and what not in map(optic, own):
