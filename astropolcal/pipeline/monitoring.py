@@ -157,12 +157,11 @@ def _group(entries, rows, moment, goal, limit, events):
             continue
         rivals = [one for one in row["or"].split(", ") if one]
         known = {"what": what, "or": rivals, "course": course}
-        told = listed([what, *rivals], "or")
-        words = f"{told} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
+        words = (
+            f"{listed([what, *rivals], 'or')} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
+        )
         content["courses"].append(known | {name: row[name] for name in COURSES} | {"words": words})
-        for before, after, surely, others in steps:
-            if surely < LIKELY:
-                continue
+        for before, after, surely, others in (one for one in steps if one[2] >= LIKELY):
             told = listed([what, *others], "or")
             days = [_start(e)[:10] for e in dated if e.name in (before, after)]
             words = f"{told} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
