@@ -149,24 +149,7 @@ def _group(entries, rows, moment, goal, limit, events):
             found = ()
             few = f"{counted(len(dated), 'calibration')} with a date; courses need at least three"
             left_out.append(few if len(dated) < 3 else str(problem))
-    doubtful = {optic(one) for row in found for one in row["or"].split(", ")}
-    for row, steps in zip(found, found.meta["steps"] if len(found) else (), strict=True):
-        what, course = row["what"], row["course"]
-        if course == "constant" and what in doubtful:
-            # it may be what another row says of another optic
-            continue
-        rivals = [one for one in row["or"].split(", ") if one]
-        known = {"what": what, "or": rivals, "course": course}
-        words = (
-            f"{listed([what, *rivals], 'or')} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
-        )
-        content["courses"].append(known | {name: row[name] for name in COURSES} | {"words": words})
-        for before, after, surely, others in (one for one in steps if one[2] >= LIKELY):
-            told = listed([what, *others], "or")
-            days = [_start(e)[:10] for e in dated if e.name in (before, after)]
-            words = f"{told} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
-            one = {"what": told, "before": before, "after": after, "from": days[0], "to": days[1]}
-            content["events"].append(one | {"probability": surely, "words": words})
+    content["courses"], content["events"] = _what_changed(found, dated)
     content["events"].sort(key=lambda one: one["to"])
     known = known_instrument(newest.calibration.instrument) or Instrument
     limit = float(known.max_age.to_value(u.day)) if limit is None else limit
@@ -178,6 +161,30 @@ def _group(entries, rows, moment, goal, limit, events):
     following = _next(newest, len(dated), late, moment, limit)
     content["next"] = [following, f"{newest.name}: {verdict.advice}"]
     return content
+
+
+def _what_changed(found, dated):
+    """Return the courses of all optics, and the steps that are likely, ready for JSON."""
+    told_courses, events = [], []
+    doubtful = {optic(one) for row in found for one in row["or"].split(", ")}
+    for row, steps in zip(found, found.meta["steps"] if len(found) else (), strict=True):
+        what, course = row["what"], row["course"]
+        if course == "constant" and what in doubtful:
+            # it may be what another row says of another optic
+            continue
+        rivals = [one for one in row["or"].split(", ") if one]
+        known = {"what": what, "or": rivals, "course": course}
+        words = (
+            f"{listed([what, *rivals], 'or')} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
+        )
+        told_courses.append(known | {name: row[name] for name in COURSES} | {"words": words})
+        for before, after, surely, others in (one for one in steps if one[2] >= LIKELY):
+            told = listed([what, *others], "or")
+            days = [_start(e)[:10] for e in dated if e.name in (before, after)]
+            words = f"{told} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
+            one = {"what": told, "before": before, "after": after, "from": days[0], "to": days[1]}
+            events.append(one | {"probability": surely, "words": words})
+    return told_courses, events
 
 
 def _next(newest, n_dated, late, moment, limit):
