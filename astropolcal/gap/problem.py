@@ -12,7 +12,7 @@ from itertools import pairwise
 import astropy.units as u
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, null_space, solve_triangular
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import nnls
 
 from astropolcal.calibration.identifiability.linearized import orthonormal, triangle
 from astropolcal.chain import Train, leaves
@@ -509,7 +509,7 @@ def _within(triangle, wanted, low, high, found):
 
     What was outside is guessed to be at its bound, and the guess is corrected for all at once
     (Portugal, Judice & Vicente 1994, doi:10.2307/2153286). Where that does not end, as in one of
-    2,000 random problems, scipy finds them one by one.
+    2,000 random problems, they are walls like others.
     """
     held = (found < low) | (found > high)
     gram, target = triangle.T @ triangle, triangle.T @ wanted
@@ -526,8 +526,8 @@ def _within(triangle, wanted, low, high, found):
         if not wrong.any():
             return found
         held ^= wrong
-    slack = 1e-9 * np.maximum(1.0, np.abs(found))
-    found = lsq_linear(triangle, wanted, (low - slack, high + slack), method="bvls").x
+    sides = np.concatenate([np.eye(len(found)), -np.eye(len(found))])
+    found = _behind_walls(triangle, wanted, sides, np.concatenate([high, -low]))
     return np.clip(found, low, high)
 
 

@@ -349,7 +349,7 @@ def test_least_squares_behind_walls_are_those_within_bounds(seed, n):
     assert squares[0] == pytest.approx(squares[1], rel=1e-5, abs=1e-6)
 
 
-def test_what_is_guessed_wrong_is_left_to_scipy(monkeypatch):
+def test_what_is_guessed_wrong_is_found_as_behind_walls(monkeypatch):
     triangle, wanted = np.array([[1.0, 0.9], [0.0, 0.1]]), np.array([1.0, -1.0])
     low, high = np.full(2, -1.0), np.full(2, 1.0)
     free = np.linalg.solve(triangle, wanted)
