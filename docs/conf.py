@@ -145,6 +145,8 @@ html_logo = html_favicon = "_static/logo.svg"
 # pages of source are wide, and their navigation would be most of the time of a build
 html_sidebars = {"[!_]**": ["components/sst-sidebar-nav.html"], "_modules/**": []}
 html_theme_options = {
+    # pages with the navigation of all other pages are twice as large
+    "collapse_navigation": True,
     "logo": {"text": "astropolcal", "alt_text": "Logo of astropolcal"},
     "navbar_start": "components/navbar-logo.html",
     "navbar_links": [

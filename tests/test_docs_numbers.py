@@ -215,7 +215,7 @@ def test_numbers_of_a_target(joint):
     _states("DoLP above", equal[short].min(), equal[short].max(), np.median(equal))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_numbers_of_the_law_of_m3(joint_data):
     """Which of many equal sets comes out hangs on rounding; that none is determined does not."""
     cal = as_published(joint_data, m3="power law")

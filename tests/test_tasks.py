@@ -75,7 +75,7 @@ def test_bad_input():
         ended(math.sqrt, [4], timeout=-1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_does_the_same():
     distributed = pytest.importorskip("distributed", reason="distributed is not installed")
     options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}

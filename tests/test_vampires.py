@@ -252,7 +252,7 @@ def test_lamp_need_not_be_steady_where_states_alternate():
     assert VAMPIRES.prepare(night).mask.sum() == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_calibration_recovers_the_retardances():
     chain, night = run()
     start = VAMPIRES.chains_for([night], derotator="linear")[0]

@@ -403,7 +403,7 @@ def test_cubes_give_back_the_truth(tmp_path):
     assert np.sqrt(np.mean(found.residuals**2)) < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commands_from_simulation_to_a_corrected_star(tmp_path, capsys):
     cubes, star, table = tmp_path / "cubes", tmp_path / "star", tmp_path / "obs.ecsv"
     cal, summary = tmp_path / "cal.asdf", tmp_path / "star.json"

@@ -100,7 +100,7 @@ def test_errors_of_triple_differences_are_their_scatter():
     assert np.std(pulls) == pytest.approx(1, abs=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fit_of_triple_differences_gives_back_the_truth():
     night, start = lamp(noise=False), internal()
     # triple differences do not see these

@@ -113,7 +113,7 @@ def test_what_only_a_combination_of_optics_tells_is_a_change(steady):
     assert found["hwp.theta"]["when"] == "2021-01-01 to 2021-07-01"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_that_rest_on_few_settings_are_no_change():
     """The derotator stops somewhere else at each of four settings, in each run."""
     for seed in range(3):

@@ -421,7 +421,7 @@ def sky_recovered(chain, wrong, q, u_, wavelength):
     return np.array(result)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sky_error_is_that_of_a_wrong_calibration(full_rank):
     """One sigma along each determined direction, inverted without linearizing."""
     sky = [leaf for leaf in full_rank.chain if leaf.name != "calibration_polarizer"]

@@ -229,7 +229,7 @@ def test_weights_without_errors():
 # --- the walkers: posteriors that are known -----------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_linear_normal_posterior(linear):
     posterior = sample(linear, noise=NOISE, n_walkers=32, n_steps=1200, seed=1, progress=False)
     assert_normal(posterior, *exact(linear, NOISE))

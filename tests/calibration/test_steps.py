@@ -249,7 +249,7 @@ def robust(spoiled):
     return cache(lambda loss: calibrate(*spoiled, loss=loss, **options))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_robust_loss_is_not_pulled(robust):
     def error(loss):
         found = robust(loss).parameter_values()["m3.diattenuation"]["value"]

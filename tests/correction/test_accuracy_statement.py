@@ -51,7 +51,7 @@ def check(calibration, seen, dolp, aolp, choice="infinite"):
     np.testing.assert_allclose(table["s_chi"].to_value(u.deg), rms[3], rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:poorly determined at 1 of 22 wavelengths")
 def test_correct_claims_what_the_calibration_says(calibration, seen):
     for known in [None, LACKING]:

@@ -787,7 +787,7 @@ def test_fluxes_that_data_share_count_once_in_the_errors(sky, charis, track, see
         correct(sky, frames, observable="single", weights=weights)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_aperture_of_turned_images_has_the_noise_of_a_sum():
     """Neighbours of resampled pixels are correlated: their variances do not add up to it."""
     chain = optics.LinearRetarder(retardance=180 * u.deg, mount="hwp", name="hwp")

@@ -33,7 +33,7 @@ def test_a_cluster_changes_no_number(star, sky, charis, tmp_path):
     assert np.isfinite(found.stokes).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_workers_that_are_processes(cubes_of_stars):
     """Files are opened by each worker; nothing but their names and the solution is sent."""
     distributed = pytest.importorskip("distributed", reason="distributed is not installed")

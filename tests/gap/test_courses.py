@@ -133,7 +133,7 @@ def test_what_changes_in_a_way_that_no_table_has_is_located_and_not_named():
         assert {"place": place, "kind": kind, "dependence": None} in cells, course
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_causes_are_no_course():
     diagnosis, _, score = answered(5, kind="pair", snr=40)
     assert (score, len(diagnosis.causes), diagnosis.courses) == ("right", 2, [])

@@ -91,7 +91,7 @@ def test_clean_data_have_no_gap(make):
     assert found.gap_before_percent == pytest.approx(found.noise_floor_percent, rel=0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_prior_with_units_is_that_of_scipy():
     """Of the angle of what is mounted, free or held at another value."""
     window = optics.LinearRetarder(retardance=3 * u.deg, theta=10 * u.deg, name="window")
@@ -204,7 +204,7 @@ def test_a_wrong_sign_is_found(name, effect):
 ROWS = {"effects": ["hwp_early", "hwp_late", "angles_early", "angles_late", "hwp_doubled"]}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
     few = data.WAVELENGTH[::2]
     right = data.observed(flux=2e7, wavelength=few)
@@ -249,7 +249,7 @@ def test_a_misread_angle_is_found_where_the_star_is_hardly_polarized():
         assert names(found.causes[0]) == [name]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_two_tables_the_one_that_is_misread_is_named():
     first, second = (data.observed(flux=1e7, seed=seed, name=f"run {seed}") for seed in (1, 2))
     table = second.to_table()
@@ -446,7 +446,7 @@ def test_a_star_tells_what_a_chain_without_free_parameters_lacks():
     assert found.gap_after_percent < 0.2 * found.gap_before_percent
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wrong_sign_is_not_told_where_one_cause_does_better():
     """The polarization of a standard is a little off: halved plate angles explain most of it."""
     source = "polarized standard star"

@@ -37,7 +37,7 @@ def plate_chain(retardance=180.0, free=False):
     return polarizer | plate | prism
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_half_a_wave_hides_nothing():
     for true, free in [(176.0, False), (176.0, True), (184.0, True)]:
         data = simulate(plate_chain(true), WAVELENGTH, TURN, flux=1e6, seed=1, name="turn")
@@ -67,7 +67,7 @@ def test_a_fit_does_not_stay_at_half_a_wave(own_instruments):
     assert better.fit.chi2 < 0.3 * nominal.fit.chi2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_parameter_beyond_its_bound_is_named():
     true, narrow = chain(), chain()
     true["hwp"].theta = 2 * u.deg
@@ -109,7 +109,7 @@ def test_no_size_makes_more_polarization_than_there_is():
             assert model.keeps_polarization(cell.name) is possible, (kind, size, possible, place)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_held_source_is_looked_at_like_all_others():
     """VAMPIRES with a lamp of which the model says that it knows the polarization."""
     for q, u_ in [(0.87, 0.1), (0.9, 0.13)]:
@@ -138,7 +138,7 @@ def test_a_held_source_is_looked_at_like_all_others():
         assert found.remainder_p_value > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_retarder_beside_a_plate_that_is_pressed_to_half_a_wave():
     """No derivative shows it there; what a derivative shows instead was given 99 %."""
     wavelength = np.linspace(0.5, 0.9, 6) * u.um

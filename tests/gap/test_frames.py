@@ -155,7 +155,7 @@ def test_one_wavelength_of_three_is_no_beam():
         assert (fault.frame, fault.what) == (21, what)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_single_data_in_many_frames_are_left_out_and_counted():
     observations, chains, case = make_challenge(
         15, kind="listed", snr=40, setup=Setup(n_derotator=6)

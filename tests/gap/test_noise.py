@@ -261,7 +261,7 @@ def test_expected_fluxes_are_there_for_masked_data_too():
     assert found[0, 2, 4] == pytest.approx(observations.flux_right[4, 2], rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_noise_that_no_table_states_is_no_cause():
     """Alike at neighbouring wavelengths, or larger at some; a gain beside it is one."""
     true, n = data.chain(), len(data.WAVELENGTH)

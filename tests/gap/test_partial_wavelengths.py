@@ -16,7 +16,7 @@ CHARIS = instruments.get("charis")
 WAVELENGTH = np.geomspace(1200, 2300, 6) * u.nm
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_knows_which_wavelengths_a_dataset_has():
     frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
     chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)
@@ -30,7 +30,7 @@ def test_where_knows_which_wavelengths_a_dataset_has():
     assert "constant" in where[0]["detail"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_wavelength_a_dataset_as_filters_have_it():
     frames = half_wave_plate_cycles(derotator=[45, 70, 95, 120] * u.deg)
     chain = CHARIS.chain(derotator="linear", wavelength=WAVELENGTH)

@@ -77,7 +77,7 @@ def test_a_fault_of_one_of_two_runs_at_other_wavelengths():
 # ---- what changed ------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stage_with_another_zero_is_one_change():
     for role, optic, flux in (("hwp", "hwp", 1e6), ("polarizer", "calibration_polarizer", 1e8)):
         second = data.chain()
@@ -95,7 +95,7 @@ def test_a_stage_with_another_zero_is_one_change():
         assert np.allclose(size["value"], 0.4, atol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_optic_of_any_axis_that_one_run_has_is_one_change():
     # of the second one the derivatives alone say that it depends on the wavelength
     for run, size, theta in ((OCTOBER, 1.6, 100), (JULY, 2.2, 92)):
@@ -149,7 +149,7 @@ def test_a_change_is_found_with_its_run_cell_and_size():
     assert own["evidence_by_dataset"] == {}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_change_that_others_look_like_is_not_told_as_sure():
     turned = ("source", "rotation", "constant", np.deg2rad(0.1))
     content = to_dict(diagnose(data.chain(), pair([], [turned]), changes=True))
@@ -202,7 +202,7 @@ def test_nothing_changed_is_said_where_it_was_asked():
     assert "Nothing changed between" in summary(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_gain_is_told_as_the_difference_of_the_beams():
     runs = pair()
     runs[1] = data.with_flux(runs[1], np.full(runs[1].n_frames, 1.02))
@@ -237,7 +237,7 @@ def test_one_of_three_runs_differs():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_gain_of_one_run_that_drifts():
     drift = ("detector", "gain", "harmonic:derotator:1", 0.01)
     found = diagnose(data.chain(), pair([], [drift]), changes=True)
@@ -264,7 +264,7 @@ def test_what_an_optic_of_one_run_brought():
     assert "only one run has (dichroic)" in content["sentences"][-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_in_one_of_two_runs_are_no_harmonic_of_a_stage():
     """They look like one; a course in that run does better, and has its steps."""
     first, table = (
@@ -474,7 +474,7 @@ def tables(tmp_path):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_changes_on_the_command_line(tables, tmp_path, capsys):
     out = tmp_path / "out.json"
     options = ["--derotator", "linear", "--changes", "-q", "--json", str(out)]

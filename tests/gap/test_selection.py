@@ -239,7 +239,7 @@ def test_what_is_alike_with_a_law_is_alike_without_one():
     assert [one.cell.place for one, _ in members] == ["source", "telescope", "after:hwp"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_thing_that_changes_in_two_ways_is_one_that_no_table_has():
     """An axis that wanders looks like two errors of its encoder."""
     made = make_challenge(7, kind="mechanism", snr=25, fault={"what": "wander"})
@@ -263,7 +263,7 @@ def test_a_listed_cause_is_exchanged_for_no_other_freedom_than_the_data_ask_for(
         assert diagnosis.verdict == "named", seed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_causes_that_follow_the_same_thing_may_be_one_that_no_table_has():
     setup = SETUPS["charis"]()
     first = Cell("in:hwp", "diattenuation_h", "harmonic:derotator:1")

@@ -321,7 +321,7 @@ def standard(shared_data):
     return join([*train, gain]), Observations.from_table(table, name=star.name)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_real_star_misses_the_tertiary_mirror(standard):
     """The internal optics as the lamp has them, gains free, and no mirror in the chain."""
     chain, star = standard

@@ -58,7 +58,7 @@ def irdis_lamp(bands, n=5):
     return chain, truth, irdis.wavelength[bands], frames
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wrong_literature_value_of_a_star_is_among_the_answers():
     setup = SETUPS["cassegrain"]()
     nominal = setup.nominal.copy()
@@ -134,7 +134,7 @@ def test_noise_that_is_not_stated_and_larger_than_it_is_rough_is_not_said_to_agr
     assert "no table states the noise" in first
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wrong_frame_is_found_beside_a_cause_that_hides_it():
     chain, truth, wavelength, frames = irdis_lamp([1, 2, 3])
     window = optics.LinearRetarder(retardance=1.5 * u.deg, theta=25 * u.deg, name="window")
@@ -184,7 +184,7 @@ def test_noisy_frame_is_not_taken_for_a_restless_lamp():
     assert suspect_frames(model) + lamp_faults(model) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_data_that_a_cause_explains_are_not_said_to_be_off():
     chain, truth, wavelength, frames = irdis_lamp([0, 1, 2, 3], 6)
     turned = optics.LinearRetarder(
@@ -208,7 +208,7 @@ def test_dim_frames_that_a_cause_explains_are_not_the_lamps():
     assert found.frames == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_part_of_a_run_is_said_to_fit_that_fits_anything():
     """A quarter of the frames has fewer data than parameters; all are 20 % off at random."""
     grid = [1200, 1600, 2000] * u.nm

@@ -42,7 +42,7 @@ def names(paths):
     return [path.name for path in paths]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_writes_every_figure_as_png(elliptical, tmp_path):
     pytest.importorskip("corner")
     folder = tmp_path / "new" / "figures"

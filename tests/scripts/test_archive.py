@@ -230,7 +230,7 @@ def test_an_archive_is_corrected_and_gone_on_with(lab, tmp_path, capsys):
     assert archive(lab, out, "--mode", "ip")[1]["n_worked_on"] == N
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sequence_that_fails_stops_no_other(lab, tmp_path, capsys):
     tree, out = tmp_path / "tree", tmp_path / "out"
     for path in (lab / "tree").rglob("*.fits"):
@@ -279,7 +279,7 @@ def test_the_summary_fits_a_terminal(lab, tmp_path, capsys):
     assert capsys.readouterr().out.count("  failed: ") == 30
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_calibration_of_each_sequence_comes_from_a_library(lab, tmp_path):
     folder = tmp_path / "library"
     folder.mkdir()
@@ -293,7 +293,7 @@ def test_the_calibration_of_each_sequence_comes_from_a_library(lab, tmp_path):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_newer_calibration_makes_its_products_again(lab, tmp_path):
     folder, out = tmp_path / "library", tmp_path / "out"
     folder.mkdir()

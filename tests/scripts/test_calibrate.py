@@ -411,7 +411,7 @@ def test_nothing_is_masked_where_all_is_to_be_kept(tables, star_table, tmp_path)
     assert content["datasets"][0]["n"] == [15, 15, 15]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*frames (masked|left out)")
 def test_model_of_the_tertiary_mirror(tables, star_table, tmp_path):
     content = run(tmp_path, star_table, tables["first"], *HELD, "--m3", "metal")

@@ -128,7 +128,7 @@ def test_pixels_that_measure_nothing_are_left_to_the_other_frames(night, tmp_pat
         np.testing.assert_allclose(aperture[key], truth, atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_product_is_not_usable_where_its_calibration_is_not(night, tmp_path, capsys):
     calibration = Calibration.read(night / "charis.asdf")
     calibration.fit["converged"] = False
@@ -164,7 +164,7 @@ def test_light_polarized_by_more_than_all_of_it_is_not_usable():
         assert any(verdict in line for line in _correct._words(summary, None, arguments)), degree
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_star_is_subtracted_and_told(night, tmp_path, capsys):
     out, summary = tmp_path / "out.fits", tmp_path / "s.json"
     paths, cal = sorted((night / "cubes").glob("*.fits"))[:4], night / "charis.asdf"
@@ -191,7 +191,7 @@ def test_a_star_is_subtracted_and_told(night, tmp_path, capsys):
     assert "'101,3': 101 %; allowed are 0 to 100 %" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_modes_differ(night, tmp_path):
     words = [night / "cubes", "--calibration", night / "charis.asdf", "-q", "--size", 21]
     for mode in ("stokes", "ip"):
@@ -207,7 +207,7 @@ def test_modes_differ(night, tmp_path):
     assert np.abs(q["ip"] - Q).max() > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_calibration_comes_from_a_library(night, tmp_path):
     library = pytest.importorskip("astropolcal.pipeline.library").Library
     from astropolcal import Calibration
@@ -317,7 +317,7 @@ def changed(night, folder, *keywords):
     return paths
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_derotator_that_kept_something_else_than_stated(night, tmp_path):
     """While the parallactic angle turns from 20 to 32 deg at an altitude of 70 deg."""
     plate = instruments.get("charis").sky_law.plate_law()

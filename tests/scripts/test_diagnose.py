@@ -92,7 +92,7 @@ def test_no_module_is_imported_that_takes_long(folder, tmp_path):
     assert b"distribution: norm" in (tmp_path / "improved.asdf").read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_tables_with_report_and_calibration(folder, tmp_path, capsys, monkeypatch):
     # where no exposure is better, what was saved is next
     monkeypatch.setattr("astropolcal.gap.report.plan", lambda diagnosis: [])
@@ -159,7 +159,7 @@ def test_a_model_that_misreads_angles_is_not_saved(tmp_path, capsys):
     assert json.loads((tmp_path / "out.json").read_text())["misread"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_model_of_a_calibration(folder, cal, tmp_path):
     content = run(tmp_path, cal, folder / "polarized.ecsv", *FEW)
     assert content["causes"][0]["effect"] == "beam_gain"

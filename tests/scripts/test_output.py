@@ -157,7 +157,7 @@ def test_output_fits_a_terminal():
         assert_fits(without_warnings(err))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_summary_says_five_things_in_24_lines():
     for package in ("emcee", "arviz_stats"):
         pytest.importorskip(package)
@@ -213,7 +213,7 @@ def test_examples_of_the_help_are_commands():
             assert PARSER.parse_args(words.split()).command == (command or words.split()[0]), words
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_moves_the_cursor_of_a_pipe():
     """Progress bars and colours are for terminals; a log is plain text."""
     for words in ["simulate --cubes piped --derotator 45 --hwp 0,45", "effects"]:
