@@ -202,6 +202,24 @@ def test_health_says_what_needs_care(folder):
             health(folder, events=events)
 
 
+@pytest.mark.slow
+def test_each_of_two_steps_of_an_optic_is_an_event_with_its_own_probability(steady, tmp_path):
+    """The second is faint beside the first."""
+
+    def twice(truth, i):
+        lost = 0.01 * (i >= 2) + 0.0008 * (i >= 5)
+        truth["wollaston"].efficiency = truth["wollaston"].efficiency.value - lost
+
+    for i in range(N):
+        Library(tmp_path).add(steady[i] if i < 2 else run(i, twice))
+    (group,) = health(tmp_path, now="2024-01-01")["groups"]
+    first, second = group["events"]
+    assert {first["what"], second["what"]} == {"wollaston"}
+    assert (first["from"], first["to"]) == ("2020-07-01", "2021-01-01")
+    assert second["from"] >= "2021-07-01"
+    assert second["probability"] < first["probability"]
+
+
 def test_a_change_is_dated_by_the_data_whatever_is_stated_of_when_they_hold(worn):
     stated = [with_validity(one, valid_from=f"{2010 + i % 3}-01-01") for i, one in enumerate(worn)]
     assert courses(stated).meta == courses(worn).meta
