@@ -287,14 +287,11 @@ def check_together(actions, arguments):
                 words, value = label_of(action.dest), getattr(arguments, action.dest)
                 if not isinstance(value, bool | list):
                     words += f" {value}".removesuffix(".0")
-                words += " cannot be combined with " if rule == "not" else " needs "
-                raise ParameterError(words + _shown(known[name]))
-
-
-def _shown(action):
-    """Return how an option is typed, with what stands for its value."""
-    values = action.metavar or "|".join(c for c in action.choices or () if c != action.default)
-    return " ".join([*action.option_strings[-1:], values])
+                words += " cannot be combined with" if rule == "not" else " needs"
+                other = known[name]
+                choices = (c for c in other.choices or () if c != other.default)
+                values = other.metavar or "|".join(choices)
+                raise ParameterError(" ".join([words, *other.option_strings[-1:], values]))
 
 
 def _pair(text):

@@ -61,7 +61,8 @@ def _one(arguments):
     lines = _describe(star, content["known"])
     if arguments.night is None:
         return lines, content
-    seen = _observability(star.name, arguments)
+    site, limit = _site(arguments.site), arguments.min_altitude * u.deg
+    seen = standards.observability(star.name, site, arguments.night, min_altitude=limit)
     (low, high), (first, last) = seen.altitude.value, seen.parallactic.value
     content |= {"site": arguments.site, "night": seen.night, "hours": seen.hours.value}
     content |= {"transit": seen.transit.iso, "altitude_deg": [low, high]}
@@ -81,11 +82,6 @@ def _one(arguments):
         f"  M3 error     {with_error(error, '.3f')} of one frame's error (32 frames)",
     ]
     return lines, content
-
-
-def _observability(name, arguments):
-    limit = arguments.min_altitude * u.deg
-    return standards.observability(name, _site(arguments.site), arguments.night, min_altitude=limit)
 
 
 def _describe(star, known):
