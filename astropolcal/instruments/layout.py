@@ -333,13 +333,10 @@ class FileLayout:
         if not self.beam_files:
             return files
         # left files without a right one stay, so that the error names them
-        rights = [path for path in files if self.is_right(path)]
+        mark, known = self.beam_files[0], self.partners
+        rights = [path for path in files if str(path) in known or mark in Path(path).name]
         lefts = {str(self.left_file(path)) for path in rights}
         return [path for path in files if str(Path(path)) not in lefts]
-
-    def is_right(self, path):
-        """Return whether a file is known to be of the right beam, by its name or by headers."""
-        return str(path) in self.partners or self.beam_files[0] in Path(path).name
 
 
 def side_by_side(rows, columns, lit):

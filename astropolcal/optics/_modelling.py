@@ -124,7 +124,7 @@ class OpticParameter(Parameter):
         if law is None:
             return None
         values = [getattr(self.model, name) for name in law.names(self.name)]
-        return law.in_units([p.value for p in values])
+        return with_values(law.model, [p.value for p in values], law.units)
 
     def at(self, wavelength, values):
         """Return values of the parameter at wavelengths (um), between its own on straight lines."""

@@ -103,10 +103,6 @@ class Law:
     def _evaluated(self, inputs, numbers):
         return self.model.evaluate(*inputs, *numbers) * canonical_factor(self.unit)
 
-    def in_units(self, values):
-        """Return the model with values of its coefficients, in their units."""
-        return with_values(self.model, values, self.units)
-
     def with_known(self, ends):
         """Return the law with the lowest and highest of its inputs, of those of all positions."""
         return replace(self, known={name: ends[name] for name in self.of if name in ends})
