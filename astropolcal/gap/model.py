@@ -628,26 +628,41 @@ def _alternatives(chains, observations, made, discrete, say):
     With them, the chains, datasets and calibration of which they are alternatives, and the name of
     the part of a dataset that does not fit, see `_parts`.
     """
-    misfit, asked, found = _misfit(made), (chains, observations, made), []
-    # tables are seldom misread: that is asked where signs and reflections leave much
-    misread = [e for e in discrete if isinstance(e, Misread)]
-    for some in ([e for e in discrete if e not in misread], misread):
-        if not found or found[0][0] > _SETTLED * misfit:
-            found = _tried(chains, observations, some, say, found)
-    settled = bool(found) and found[0][0] <= _SETTLED * misfit
-    where = ""
+    misfit, asked, where = _misfit(made), (chains, observations, made), ""
+    enough, least = _SETTLED * misfit, _ABOVE_NOISE * _usual(made, "sigma")
+    stages = {"enough": enough, "least": least if np.isfinite(least) else enough}
+    found = _by_stages(chains, observations, discrete, say, **stages)
+    settled = bool(found) and found[0][0] <= enough
     if not settled:
         # or in a part of the run: there is a frame too many, or one was lost
         some = [e for e in discrete if e.may_be_in_part]
         inside, parts, where = _in_part(chains, observations, misfit, some, say)
         if inside:
             return inside, (*parts, nominal_calibration(*parts)), where
-    if len(observations) > 1 and (not settled or found[0][1] in misread):
+    if len(observations) > 1 and (not settled or isinstance(found[0][1], Misread)):
         # all but one of the tables may be right
         some = [found[0][1]] if settled else [e for e in discrete if e.may_be_in_part]
         apart = [e.in_run(o.name) for e in some for o in observations]
-        found = _tried(chains, observations, apart, say, found)
+        found += _by_stages(chains, observations, apart, say, **stages)
+        found.sort(key=lambda one: one[0])
     return found, asked, where
+
+
+def _by_stages(chains, observations, effects, say, enough, least):
+    """Return misfit and effect of alternatives, best first; rarer ones if others are above a least.
+
+    One that leaves no more than is enough gives way only to what is far better.
+    """
+    # tables are seldom misread, and more seldom by several frames
+    misread = [e for e in effects if isinstance(e, Misread)]
+    found, signs = [], [e for e in effects if e not in misread]
+    for some in (signs, misread, [way for e in misread for way in e.farther()]):
+        before = found[0][0] if found else np.inf
+        if not before <= least:
+            more = _tried(chains, observations, some, say, found)
+            gives_way = before > enough or more[0][0] < _FAR_BETTER * before
+            found = more if gives_way else found
+    return found
 
 
 def _in_part(chains, observations, misfit, effects, say):
@@ -659,7 +674,8 @@ def _in_part(chains, observations, misfit, effects, say):
 
     def tried(*edge):
         *parts, where = _split(chains, observations, *edge)
-        found = _tried(*parts, [e.in_run(where) for e in effects], say, [])
+        apart = [e.in_run(where) for e in effects]
+        found = _by_stages(*parts, apart, say, _SETTLED * misfit, _SETTLED * misfit)
         return [one for one in found if one[0] < _SETTLED * misfit], parts, where
 
     say("where the model begins to fail")
@@ -802,16 +818,19 @@ def _misfit(calibration):
     return rms(calibration.measurement.residuals())
 
 
+def _usual(calibration, what):
+    """Return the root mean square of the double differences, ``"observed"``, or their noise."""
+    parts = [np.square(getattr(d, what)).ravel() for d in calibration.measurement.datasets]
+    return float(np.sqrt(np.mean(np.concatenate(parts))))
+
+
 def _may_be_wrong(calibration):
     """Return whether the double differences are so far off that a sign may be wrong."""
-    misfit, datasets = _misfit(calibration), calibration.measurement.datasets
+    misfit = _misfit(calibration)
     size = np.sort(np.abs(calibration.measurement.residuals()))
     if rms(size[: max(1, int(_MOST_DATA * size.size))]) < _SHOWS * misfit:
         return False
-    signal, noise = (
-        float(np.sqrt(np.mean(np.concatenate([np.square(part(d)) for d in datasets]))))
-        for part in (lambda d: d.observed, lambda d: d.sigma)
-    )
+    signal, noise = (_usual(calibration, what) for what in ("observed", "sigma"))
     # what has no stated errors has no noise to compare with
     clear = not misfit < _ABOVE_NOISE * noise
     return misfit > _WRONG_SIGN or (misfit > _WRONG_SHARE * signal and clear)
@@ -819,10 +838,8 @@ def _may_be_wrong(calibration):
 
 def _left(best, given):
     """Return the share of what exceeds the noise in double differences that a fit leaves."""
-    noise = np.mean(np.concatenate([np.square(d.sigma) for d in best.measurement.datasets]))
-    left, whole = (
-        max(_misfit(one) ** 2 - np.nan_to_num(noise, posinf=0.0), 1e-300) for one in (best, given)
-    )
+    noise = np.nan_to_num(_usual(best, "sigma") ** 2, posinf=0.0)
+    left, whole = (max(_misfit(one) ** 2 - noise, 1e-300) for one in (best, given))
     return float(left / whole)
 
 
