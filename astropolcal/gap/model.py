@@ -5,7 +5,7 @@ import warnings
 from contextlib import suppress
 from copy import copy as copied
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -687,8 +687,8 @@ def _in_part(chains, observations, misfit, effects, say):
         i, order, words, good = edge
         best = nominal_calibration(*_read(found[0][1], *parts))
         # in double differences a frame without a partner is not seen, and few of many are no misfit
-        sure = _nearer(best.chains[i : i + 2], observations[i], order)
-        again = tried(i, order, words, sure) if sure != good else ([],)
+        sure = _nearer(best.chains[i : i + 2], observations[i], order, words)
+        again = tried(i, sure[0], words, sure[1]) if sure[1] != good else ([],)
         found, parts, where = again if again[0] else (found, parts, where)
     return found, parts, where
 
@@ -697,16 +697,24 @@ def _edge(chains, observations, misfit):
     """Return which dataset fits in part, the order of its frames, and how many of them do.
 
     These are the most that the model fits with all other datasets, from the first frame on or up to
-    the last. Before their number is where the others are, in words. None without such frames.
+    the last, or both together. Before their number is where the others are, in words. None without
+    such frames.
     """
     few_chains, few = thinned(chains, observations, _FEW)
     for i, whole in enumerate(observations):
         forward = np.argsort(whole.position("sequence"), kind="stable")
-        parts = few[:i], few[i + 1 :], few[i]
+        share = partial(_share_left, few_chains, few, i, misfit)
         found = [
-            (i, order, words, _fitting(few_chains, *parts, order, misfit))
+            (i, order, words, _fitting(share, order))
             for order, words in ((forward, "from"), (forward[::-1], "up to"))
         ]
+        start, stop = found[0][-1], len(forward) - found[1][-1]
+        # all frames have a partner in their part, or it is none
+        for more in range(_SUDDEN) if 0 < start < stop < len(forward) else ():
+            order, good = _around(forward, start - more, stop + more)
+            parts = _split(few_chains, few, i, order, "in", good)
+            if np.isfinite(_tried_misfit(*parts[:2])) and share(order[:good]) <= _FITS:
+                return i, order, "in", good
         found = [edge for edge in found if edge[-1] < len(forward)]
         if found:
             return max(found, key=lambda edge: edge[-1])
@@ -717,16 +725,34 @@ def _split(chains, observations, i, order, words, good):
     """Return chains and datasets, one of these in two parts, and the name of the second part."""
     whole = observations[i]
     parts = [whole.select(np.sort(part)) for part in (order[:good], order[good:])]
-    parts[1].name = f"{whole.name} {words} frame {frame_names(whole.frames)[order[good]]}"
+    names = frame_names(whole.frames)
+    where = f"{words} frame {names[order[good]]}"
+    where += f"-{names[order[-1]]}" * (words == "in")
+    parts[1].name = f"{whole.name} {where}"
     split = [*observations[:i], *parts, *observations[i + 1 :]]
     return [*chains[: i + 1], *chains[i:]], split, parts[1].name
 
 
-def _nearer(chains, whole, order):
+def _around(order, start, stop):
+    """Return an order of frames with those from one up to another at its end, and where they are."""
+    middle = order[start:stop]
+    return np.concatenate([order[:start], order[stop:], middle]), len(order) - len(middle)
+
+
+def _share_left(chains, observations, i, misfit, rows):
+    """Return the share of a misfit that is left with some of the frames of one dataset."""
+    # all of them may be masked
+    with suppress(ObservationError):
+        part = observations[i].select(np.sort(rows))
+        return _tried_misfit(chains, [*observations[:i], part, *observations[i + 1 :]]) / misfit
+    return np.inf
+
+
+def _nearer(chains, whole, order, words):
     """
     Return how many frames of a dataset are those of the first of two chains, and not of the second.
 
-    That is decided frame by frame, in single differences.
+    That is decided frame by frame, in single differences; before it their order, these first.
     """
     off = []
     for chain in chains:
@@ -734,29 +760,30 @@ def _nearer(chains, whole, order):
         problem.settle_noise()
         (channel,), (difference,) = problem.channels, problem.differences(problem.start)
         off.append(np.sum(channel.gap(difference) ** 2, axis=0))
+    if words == "in":
+        order = np.argsort(whole.position("sequence"), kind="stable")
+        more = np.cumsum(np.append(0.0, (off[0] - off[1])[order]))
+        inside = np.triu(more - more[:, None])
+        start, stop = np.unravel_index(np.argmax(inside), inside.shape)
+        return _around(order, start, stop)
     more = np.cumsum((off[0] - off[1])[order])
     least = len(order) // _LEAST_PART
-    return least + int(np.argmin(more[least - 1 : -1]))
+    return order, least + int(np.argmin(more[least - 1 : -1]))
 
 
-def _fitting(chains, before, after, whole, order, misfit):
-    """Return how many frames of a dataset the model fits, all if it is not clear which."""
+def _fitting(share, order):
+    """Return how many frames of a dataset the model fits, all if it is not clear which.
 
-    def share(n):
-        # all of them may be masked
-        with suppress(ObservationError):
-            kept = [*before, whole.select(np.sort(order[:n])), *after]
-            return _tried_misfit(chains, kept) / misfit
-        return np.inf
-
+    ``share`` is that of the misfit that some of the frames leave.
+    """
     good, bad = len(order) // _LEAST_PART, len(order)
-    if share(good) > _FITS:
+    if share(order[:good]) > _FITS:
         return bad
     while bad - good > 1:
         middle = (good + bad) // 2
-        good, bad = (middle, bad) if share(middle) <= _FITS else (good, middle)
+        good, bad = (middle, bad) if share(order[:middle]) <= _FITS else (good, middle)
     # at once, not little by little
-    sudden = share(min(good + _SUDDEN, len(order))) > 2 * _FITS
+    sudden = share(order[: good + _SUDDEN]) > 2 * _FITS
     return good if sudden else len(order)
 
 

@@ -458,9 +458,9 @@ def _moved(angle, what):
     """Return a move of a stage in each of some frames, (F,), from its angles in their order."""
     rows = np.arange(len(angle))
     if what == "reversed":
-        # the least period of the angles, if they have any
+        # a cycle is the least period of the angles, or all of them
         tiled = (n for n in rows[2:] if np.array_equal(angle[n:], angle[:-n]))
-        period = next(tiled, 1)
+        period = next(tiled, len(angle))
         other = rows - 2 * (rows % period) + period - 1
         return np.where(other < len(angle), angle[np.minimum(other, len(angle) - 1)] - angle, 0.0)
     word = what.rstrip("0123456789")
