@@ -776,8 +776,12 @@ def _fitting(share, order):
 
     ``share`` is that of the misfit that some of the frames leave.
     """
-    good, bad = len(order) // _LEAST_PART, len(order)
-    if share(order[:good]) > _FITS:
+    bad = len(order)
+    good = bad // _LEAST_PART
+    # so few of them may determine nothing
+    while np.isinf(left := share(order[:good])) and good < bad // 2:
+        good += 1 + good // 2
+    if left > _FITS:
         return bad
     while bad - good > 1:
         middle = (good + bad) // 2
