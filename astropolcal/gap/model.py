@@ -734,7 +734,7 @@ def _split(chains, observations, i, order, words, good):
 
 
 def _around(order, start, stop):
-    """Return an order of frames with those from one up to another at its end, and where they are."""
+    """Return an order of frames with those from one up to another last, and where these begin."""
     middle = order[start:stop]
     return np.concatenate([order[:start], order[stop:], middle]), len(order) - len(middle)
 
@@ -808,8 +808,9 @@ def _tried(chains, observations, effects, say, known):
     for effect in effects:
         say(f"trying: {effect.title}")
         for one in effect.ways():
-            found.append((_tried_misfit(*_read(one, *few)), one))
-    # where it leaves too few frames it is not asked for
+            # where it leaves too few frames, or none, it is not asked for
+            with suppress(ObservationError):
+                found.append((_tried_misfit(*_read(one, *few)), one))
     found = [one for one in found if np.isfinite(one[0])]
     misfits, best = np.array([misfit for misfit, _ in found]), {}
     for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf)):

@@ -28,7 +28,7 @@ PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
 
 
 def is_move(name):
-    """Return whether a position is a move of a stage, or several: ``"hwp_move"``, ``"hwp_move2"``."""
+    """Return whether a position is a move of a stage, or several, as ``"hwp_move2"``."""
     return name.rstrip("0123456789").endswith(MOVES)
 
 

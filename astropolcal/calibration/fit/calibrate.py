@@ -526,6 +526,7 @@ def _result(fitted, covariance=None):
     stds = own.stds * measurement.free.factors()
     others = fit.pop("others", ()), fitted.lawful
     signs, errors_of_signs, fit["elsewhere"] = undecided_signs(measurement, view, stds, *others)
+    fit["minima"] = [one.pop("minimum") for one in signs if "minimum" in one]
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting

@@ -480,8 +480,8 @@ class Alternative(Effect):
         return Edit(edited, [])
 
 
-# a table is ahead or behind by up to so many frames: half of a cycle of eight, after which the plate
-# is as far behind as it is ahead
+# a table is ahead or behind by up to so many frames: half of a cycle of eight, beyond which a plate
+# that is ahead is less far behind
 _MOST_ROWS = 4
 
 
