@@ -18,9 +18,9 @@ from star_data import WAVELENGTH, observe_star, star_chain
 from astropolcal import Calibration, Normal, calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap import EFFECTS, Effect, diagnose, model, problem
+from astropolcal.gap import EFFECTS, Effect, alternatives, diagnose, model, problem
+from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.cells import Cell
-from astropolcal.gap.model import thinned
 from astropolcal.gap.report import Fitted, to_dict, with_causes
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.measurement import Measurement
@@ -587,7 +587,7 @@ def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
         left = residual * np.resize([1.0, -1.0], 20)
         measurement = SimpleNamespace(datasets=[part], residuals=lambda left=left: left)
         given = SimpleNamespace(measurement=measurement)
-        assert model._may_be_wrong(given) == wrong, (observed, residual, sigma)
+        assert alternatives._may_be_wrong(given) == wrong, (observed, residual, sigma)
 
 
 def test_thinned_data_are_spread_over_the_wavelengths():

@@ -503,7 +503,7 @@ class Misread(Alternative):
         return super().applies_to(roles) and stages.issuperset(self.stages)
 
     def farther(self):
-        """Return the same of a table that is ahead or behind by more frames."""
+        """Return the same of a table that is early or late by more frames."""
         counts = range(2, 1 + _MOST_ROWS * (self.what in ("_move", "_next")))
         titles = {n: self.title.replace("one frame", f"{n} frames") for n in counts}
         return [self.changed(what=self.what + str(n), title=titles[n]) for n in counts]
