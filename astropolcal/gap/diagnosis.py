@@ -14,6 +14,7 @@ from scipy.special import expit
 
 from astropolcal.calibration.identifiability.sky import known_instrument
 from astropolcal.exceptions import GapError
+from astropolcal.gap.alternatives import chains_of, starting_model
 from astropolcal.gap.attribution import ENOUGH, Candidate
 from astropolcal.gap.cells import count_runs
 from astropolcal.gap.effects import EFFECTS, adapted, get_effect
@@ -27,7 +28,7 @@ from astropolcal.gap.frames import (
     unknown_angles,
     without_frames,
 )
-from astropolcal.gap.model import Model, chains_of, nominal_model, starting_model
+from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.problem import GapProblem
 from astropolcal.gap.runs import distinct
 from astropolcal.gap.selection import REMAINDER, beside_one, explained_by_one, select

@@ -216,12 +216,13 @@ def not_off(model, observations, faults):
 
 
 def unknown_angles(observations, effect):
-    """Return the frames whose angle, as an alternative reads it, is in no row of the table."""
+    """Return the frames whose angle, as an alternative reads it, is in no row of their table."""
     found = []
     for i, one in enumerate(observations):
         for f in np.flatnonzero(effect.edge(one)):
             number = int(one.frames["frame"][f])
-            words = f"frame {frame_names(one.frames)[f]}: its angle is in no row of the table"
+            name = frame_names(one.frames)[f]
+            words = f'frame {name}: its angle is in no row of "{one.name}"'
             given = {"probability": 1.0, "words": words, "place": (i, int(f))}
             found.append(FrameFault(one.name, number, "unknown", **given))
     return found

@@ -25,7 +25,7 @@ from astropolcal.exceptions import AstropolcalError, ObservationError, Parameter
 from astropolcal.files import one_line, understood
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import MOVES, PLACES, finite_position
+from astropolcal.optics.positions import PLACES, finite_position, is_move
 from astropolcal.units import angle_to_rad, mjd_of, plain_number, to_unit
 from astropolcal.words import check_choice, check_type
 
@@ -429,17 +429,12 @@ def frame_coordinate(observations, name):
         stage = name.removesuffix("_rate")
         turn = _TURNS.get(stage, 2 * np.pi)
         return angle_change(observations, observations.position(stage), turn)
-    if name.endswith(MOVES):
+    if is_move(name):
         stage, _, what = name.rpartition("_")
         angle = observations.position(stage)
         out = np.zeros_like(angle)
         for order in courses:
-            steps = np.diff(angle[order], prepend=angle[order[:1]])
-            # a stage that stays where it is was last moved as before
-            last = np.maximum.accumulate(np.where(steps != 0, np.arange(len(steps)), 0))
-            # whether it was backwards, or how far
-            found = {"direction": steps[last] < 0, "move": steps, "next": np.append(steps[1:], 0.0)}
-            out[order] = found[what]
+            out[order] = _moved(angle[order], what)
         return out
     # (2, B, F): beam, wavelength, frame, as the optics of a chain want them
     fluxes = np.stack([observations.flux_right.T, observations.flux_left.T])
@@ -457,6 +452,26 @@ def frame_coordinate(observations, name):
         now, before = fluxes[..., order[1:]], fluxes[..., order[:-1]]
         ratio[..., order[1:]] = np.divide(now, before, out=np.ones_like(now), where=before != 0)
     return np.where(np.isnan(ratio), 1.0, ratio)
+
+
+def _moved(angle, what):
+    """Return a move of a stage in each of some frames, (F,), from its angles in their order."""
+    rows = np.arange(len(angle))
+    if what == "reversed":
+        # a cycle is the least period of the angles, or all of them
+        tiled = (n for n in rows[2:] if np.array_equal(angle[n:], angle[:-n]))
+        period = next(tiled, len(angle))
+        other = rows - 2 * (rows % period) + period - 1
+        return np.where(other < len(angle), angle[np.minimum(other, len(angle) - 1)] - angle, 0.0)
+    word = what.rstrip("0123456789")
+    count = int(what[len(word) :] or 1)
+    if word == "next":
+        return angle[np.minimum(rows + count, rows[-1:])] - angle
+    steps = angle - angle[np.maximum(rows - count, 0)]
+    if word == "move":
+        return steps
+    # whether it was backwards; a stage that stays where it is was last moved as before
+    return steps[np.maximum.accumulate(np.where(steps != 0, rows, 0))] < 0
 
 
 def _brightness(flux, seen):

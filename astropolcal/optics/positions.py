@@ -16,13 +16,20 @@ __all__ = ["COORDINATES"]
 FLUXES = ("flux", "total_flux", "previous_flux")
 
 #: What stands behind the name of a stage for its last move: 1 where it went backwards, else 0; how
-#: far, and how far the next one goes, in radian; by how much it changes from frame to frame.
-MOVES = ("_direction", "_move", "_next", "_rate")
+#: far, and how far the next one goes, in radian, or the last or next few with their number behind;
+#: by how much it changes from frame to frame; how far its angle is from that which the frame would
+#: have if each of its cycles came in reverse order.
+MOVES = ("_direction", "_move", "_next", "_rate", "_reversed")
 
 
 #: What laws of parameters depend on beside the stages, with its unit: the moment as Modified
 #: Julian Date (UTC), and the place in the field.
 PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
+
+
+def is_move(name):
+    """Return whether a position is a move of a stage, or several, as ``"hwp_move2"``."""
+    return name.rstrip("0123456789").endswith(MOVES)
 
 
 class _Coordinates(tuple):
@@ -32,7 +39,7 @@ class _Coordinates(tuple):
 
     def __contains__(self, name):
         known = tuple.__contains__(self, name) or name in PLACES
-        return known or (isinstance(name, str) and ("=" in name or name.endswith(MOVES)))
+        return known or (isinstance(name, str) and ("=" in name or is_move(name)))
 
 
 #: Positions that are numbers, not angles: how far the run has come (0 to 1), the state of a

@@ -177,7 +177,7 @@ def _few():
 
 def _few_chains(effect):
     """Return the chains of an effect's scene at three wavelengths."""
-    from astropolcal.gap.model import thinned
+    from astropolcal.gap.alternatives import thinned
 
     make = scene_of(effect.name)
     if make is None:

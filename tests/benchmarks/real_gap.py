@@ -22,8 +22,8 @@ from astropolcal import instruments
 from astropolcal.chain import leaves, remove_optic
 from astropolcal.files import atomic_path
 from astropolcal.gap import diagnose
+from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.effects import get_effect
-from astropolcal.gap.model import thinned
 from astropolcal.gap.report import to_dict
 from astropolcal.gap.shrinkage import foreseen, frame_groups
 from astropolcal.observations import Observations

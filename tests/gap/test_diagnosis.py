@@ -18,9 +18,9 @@ from star_data import WAVELENGTH, observe_star, star_chain
 from astropolcal import Calibration, Normal, calibrate, instruments, optics
 from astropolcal.chain import insert_optic, join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError
-from astropolcal.gap import EFFECTS, Effect, diagnose, model, problem
+from astropolcal.gap import EFFECTS, Effect, alternatives, diagnose, model, problem
+from astropolcal.gap.alternatives import thinned
 from astropolcal.gap.cells import Cell
-from astropolcal.gap.model import thinned
 from astropolcal.gap.report import Fitted, to_dict, with_causes
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.measurement import Measurement
@@ -234,6 +234,45 @@ def test_angles_of_another_row_or_unit_are_a_mistake_of_the_table():
         assert [fault.frame for fault in found.frames] == ([] if edge is None else [edge])
         # nor has that frame a part in what calibrate says
         assert content["accuracy_after"]["rms_percent"] < 0.1
+
+
+@pytest.mark.parametrize(
+    "in_part",
+    [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.long)],
+)
+def test_a_plate_that_lags_and_cycles_in_another_order_are_one_cause(in_part):
+    turn = np.linspace(45, 110, 6) * u.deg
+    few = data.WAVELENGTH[::2]
+    right = data.observed(flux=1e7, wavelength=few, table=half_wave_plate_cycles(derotator=turn))
+    n, cycle = right.n_bins, right.n_frames // len(turn)
+    rows = np.arange(right.n_frames)
+    middle = (rows >= 3 * cycle) & (rows < 4 * cycle)
+    in_reverse = rows - 2 * (rows % cycle) + cycle - 1
+    part = f"/dataset:run in frame {3 * cycle}-{4 * cycle - 1}"
+    # the row of the run whose angle the table states, and the frames of which it has none
+    cases = {
+        "hwp_early": (np.roll(rows, -2), [0, 1]),
+        "hwp_reversed": (in_reverse, []),
+        f"hwp_reversed{part}": (np.where(middle, in_reverse, rows), []),
+        f"beams_swapped{part}": (rows, []),
+    }
+    asked = {"effects": [*ROWS["effects"], "hwp_reversed", "beams_swapped"], "cells": False}
+    for name, (order, edge) in cases.items():
+        if in_part != (part in name):
+            continue
+        table = right.to_table()
+        table["hwp"] = table["hwp"].reshape(-1, n)[order].ravel()
+        if name.startswith("beams"):
+            for key in ("{}", "{}_err"):
+                one, other = (key.format(f"flux_{side}") for side in ("right", "left"))
+                both = np.repeat(middle, n)
+                table[one][both], table[other][both] = table[other][both], table[one][both]
+        found = diagnose(
+            data.chain(few), Observations.from_table(table, name="run"), **QUICK, **asked
+        )
+        assert found.verdict == "named", name
+        assert name in names(found.causes[0])
+        assert [fault.frame for fault in found.frames] == edge, name
 
 
 @pytest.mark.slow
@@ -548,7 +587,7 @@ def test_a_sign_may_be_wrong_where_double_differences_are_far_off():
         left = residual * np.resize([1.0, -1.0], 20)
         measurement = SimpleNamespace(datasets=[part], residuals=lambda left=left: left)
         given = SimpleNamespace(measurement=measurement)
-        assert model._may_be_wrong(given) == wrong, (observed, residual, sigma)
+        assert alternatives._may_be_wrong(given) == wrong, (observed, residual, sigma)
 
 
 def test_thinned_data_are_spread_over_the_wavelengths():

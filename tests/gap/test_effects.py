@@ -182,6 +182,7 @@ CASES = {
     "hwp_encoder_two_lobe": Case(frames=LONG),
     "hwp_halved": Case(),
     "hwp_late": Case(),
+    "hwp_reversed": Case(),
     "hwp_misalignment": Case(_ONE_SIGN, _hold("hwp")),
     "hwp_not_tracking": Case(sky=True),
     "hwp_offset": Case(),

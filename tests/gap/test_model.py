@@ -11,9 +11,10 @@ from gap_setups import SETUPS
 
 from astropolcal import instruments
 from astropolcal.gap import diagnose
+from astropolcal.gap.alternatives import starting_model
 from astropolcal.gap.challenge import Setup, make_challenge
 from astropolcal.gap.effects import Context, get_effect
-from astropolcal.gap.model import Model, nominal_model, starting_model
+from astropolcal.gap.model import Model, nominal_model
 from astropolcal.gap.problem import Fit, GapProblem
 from astropolcal.gap.report import Fitted, to_dict
 from astropolcal.observations import Observations

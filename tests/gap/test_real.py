@@ -21,7 +21,7 @@ from astropolcal import calibrate, instruments
 from astropolcal.calibration.uncertainty import robust_covariance
 from astropolcal.chain import join, leaves, remove_optic
 from astropolcal.gap import diagnose
-from astropolcal.gap.model import thinned
+from astropolcal.gap.alternatives import thinned
 from astropolcal.instruments.telescope import published_mirror
 from astropolcal.observations import Observations
 

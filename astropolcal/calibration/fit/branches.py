@@ -433,7 +433,7 @@ def _elsewhere(measurement, view, stds, minima):
             f"{free.names[far]}: in another minimum, at {shown}, the sum of squares is "
             f"{ratio:.2f} times as large: the data do not tell which is true"
         )
-        found.append({"words": words, "sky": None})
+        found.append({"words": words, "sky": None, "minimum": free.names[far]})
         chance = 1 / (1 + np.exp(lost / 2))
         away = np.maximum(away, np.sqrt(chance) * np.abs(there - seen[0]))
         if view is not None:

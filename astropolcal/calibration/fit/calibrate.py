@@ -523,9 +523,9 @@ def _result(fitted, covariance=None):
         found = fit["disagreements"] = disagreements(measurement, whitened, weighting, scatter)
         own = between_datasets(own, found)
         own, fit["lamp_moves"] = _beside_lamp(measurement, whitened, own, white)
-    stds = own.stds * measurement.free.factors()
-    others = fit.pop("others", ()), fitted.lawful
-    signs, errors_of_signs, fit["elsewhere"] = undecided_signs(measurement, view, stds, *others)
+    told = own.stds * measurement.free.factors(), fit.pop("others", ()), fitted.lawful
+    signs, errors_of_signs, fit["elsewhere"] = undecided_signs(measurement, view, *told)
+    fit["minima"] = [one.pop("minimum") for one in signs if "minimum" in one]
     finding.branches += signs
     finding.mirrors = [branch["words"] for branch in finding.branches]
     # the error of the model at a new setting

@@ -25,7 +25,7 @@ from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, ChainEr
 from astropolcal.instruments import SkyLaw
 from astropolcal.instruments.base import Instrument, without_nuisance
 from astropolcal.optics import COORDINATES, LinearPolarizer
-from astropolcal.optics.positions import MOVES
+from astropolcal.optics.positions import is_move
 
 __all__ = []
 
@@ -166,7 +166,7 @@ def sequence_of(wanted, settings):
     They are repeated for each pointing of the telescope.
     """
     own = [stage for stage in wanted if stage not in (*_POINTINGS, *COORDINATES)]
-    own = [stage for stage in own if not stage.endswith(MOVES)]
+    own = [stage for stage in own if not is_move(stage)]
     if not own or not {*own} <= {*settings}:
         return None
     known = [settings[stage] for stage in own]

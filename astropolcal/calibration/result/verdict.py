@@ -223,8 +223,9 @@ def _of_lamp(calibration):
         return []
     counted = "not" if calibration.settings["errors"] == "white" else "now"
     return [
-        f"frames are not as bright as the model has them, which moves {moved['parameter']} by "
-        f"{moved['errors']:.2g} errors, {counted} in them (observable per_frame_double_difference)"
+        "frames are not as bright as the model has them, for the lamp or an optic that it lacks, "
+        f"which moves {moved['parameter']} by {moved['errors']:.2g} errors, {counted} in them "
+        "(observable per_frame_double_difference)"
     ]
 
 
@@ -317,8 +318,7 @@ def _of_one_table(calibration):
 
 def _elsewhere(calibration):
     """Name what is far from here in other minima, which the data do not exclude."""
-    told = (one.split(": in another minimum") for one in calibration.identifiability.mirrors)
-    names = dict.fromkeys(one[0] for one in told if len(one) > 1)
+    names = dict.fromkeys(calibration.fit.get("minima") or ())
     if names:
         yield f"another minimum fits nearly as well, with another {listed(names, 'or', 2)}"
 

@@ -480,6 +480,11 @@ class Alternative(Effect):
         return Edit(edited, [])
 
 
+# a table is ahead or behind by up to so many frames: half of a cycle of eight, beyond which a plate
+# that is ahead is less far behind
+_MOST_ROWS = 4
+
+
 class Misread(Alternative):
     """Angles of stages that are not those of the table; asked for where no other alternative is."""
 
@@ -497,13 +502,21 @@ class Misread(Alternative):
         stages = {leaf.stage for leaf in roles.leaves}
         return super().applies_to(roles) and stages.issuperset(self.stages)
 
+    def farther(self):
+        """Return the same of a table that is early or late by more frames."""
+        counts = range(2, 1 + _MOST_ROWS * (self.what in ("_move", "_next")))
+        titles = {n: self.title.replace("one frame", f"{n} frames") for n in counts}
+        return [self.changed(what=self.what + str(n), title=titles[n]) for n in counts]
+
     def edge(self, observations):
         """Return the frames, (F,) of bool, whose angle is in no row of their table."""
-        if self.run not in (None, observations.name):
+        word = self.what.rstrip("0123456789")
+        count = int(self.what[len(word) :] or 1)
+        if self.run not in (None, observations.name) or word not in ("_move", "_next"):
             return super().edge(observations)
-        first = {"_move": np.min, "_next": np.max}.get(self.what)
-        sequence = observations.position("sequence")
-        return super().edge(observations) if first is None else sequence == first(sequence)
+        # exposures in their order: frames of several beams are taken at once
+        number = np.unique(observations.position("sequence"), return_inverse=True)[1]
+        return number < count if word == "_move" else number > number.max() - count
 
     def change(self, chain, optic, *, roles, label, **_):
         """Return a chain with all optics on the stages turned."""

@@ -419,6 +419,8 @@ _MISREAD = [
         "everywhere: the polarization turns at another rate", rate, "", stage)
       for name, words, rate in (("doubled", "twice as large", -0.5), ("halved", "halved", 1.0))
       for stage in _STAGES),
+    _misread("hwp_reversed", "angle of the {} in reverse order in each cycle of the table",
+        "differences of frames that are not in the middle of a cycle", 1.0, "_reversed", "hwp"),
 ]  # fmt: skip
 
 _ALTERNATIVES = [
