@@ -165,7 +165,7 @@ def calibration_from_node(node, tag=CALIBRATION_TAG):
         ],
         ties={
             name: Tie(entry["source"], entry["factor"], nodes.value_from_node(entry["offset"]))
-            for name, entry in _by_name(node["ties"], "target").items()
+            for name, entry in nodes.by_name(node["ties"], "target").items()
         },
         stages=[_stage(entry) for entry in node["stages"]],
         **{key: nodes.plain(node[key]) for key in _PLAIN},
@@ -222,23 +222,13 @@ def _identifiability(node):
     found, vectors = nodes.plain(node), node["null_vectors"]
     found["null_vectors"] = np.array(vectors) if vectors else np.zeros((0, len(node["names"])))
     for direction in (*found.setdefault("directions", []), *found.setdefault("near_null", [])):
-        entries = _by_name(direction["parameters"]).items()
+        entries = nodes.by_name(direction["parameters"]).items()
         direction["parameters"] = {name: entry["value"] for name, entry in entries}
     return Identifiability(**found)
 
 
-def _by_name(entries, key="name"):
-    """Return entries by name; of two of one name only one would be left."""
-    found = {entry[key]: entry for entry in entries}
-    if len(found) < len(entries):
-        names = [entry[key] for entry in entries]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise CalibrationFileError(f"{twice!r} is given twice in a list of parameters")
-    return found
-
-
 def _stage(node):
-    entries = _by_name(node["parameters"]).items()
+    entries = nodes.by_name(node["parameters"]).items()
     return {
         "title": node["title"],
         "parameters": {name: nodes.value_from_node(entry) for name, entry in entries},

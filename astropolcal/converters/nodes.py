@@ -83,10 +83,17 @@ def table_from_node(node):
     """Return the `~astropy.table.QTable` of a node that `node_from_table` made."""
     if node is None:
         return None
-    columns = {column["name"]: value_from_node(column) for column in node}
-    if len(columns) < len(node):
-        raise CalibrationFileError("two columns of a table have the same name")
-    return QTable(columns)
+    columns = by_name(node, what="column ").items()
+    return QTable({name: value_from_node(column) for name, column in columns})
+
+
+def by_name(entries, key="name", what=""):
+    """Return entries by name; of two of one name only one would be left."""
+    names = [entry[key] for entry in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise CalibrationFileError(f"{what}{name!r} is given twice")
+    return dict(zip(names, entries, strict=True))
 
 
 def plain(value, where="value"):
@@ -227,15 +234,12 @@ def without_priors(chain):
 
 def restore_priors(chains, nodes):
     """Give the parameters of chains the priors that `node_from_priors` wrote."""
-    table, seen = parameter_table(chains), set()
-    for node in nodes:
-        if node["parameter"] in seen:
-            raise CalibrationFileError(f"prior of {node['parameter']!r} is given twice")
-        seen.add(node["parameter"])
-        if node["parameter"] not in table:
-            raise CalibrationFileError(f"prior of {node['parameter']!r}, which no chain has")
-        for parameter in table[node["parameter"]]:
-            parameter.prior = prior_from_node(node, node["parameter"])
+    table = parameter_table(chains)
+    for name, node in by_name(nodes, "parameter", "prior of ").items():
+        if name not in table:
+            raise CalibrationFileError(f"prior of {name!r}, which no chain has")
+        for parameter in table[name]:
+            parameter.prior = prior_from_node(node, name)
 
 
 def prior_from_node(node, name):

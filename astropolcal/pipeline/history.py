@@ -377,13 +377,12 @@ def _left_open(calibration, axes):
         # its own data tell less than those of all runs, or single differences, do
         return axes.open
     held = np.isin(names, calibration.at_bound)
-    return np.concatenate([axes.open, _determined([null[:, held].T], len(null)) @ null])
+    return np.concatenate([axes.open, _determined(null[:, held].T, len(null)) @ null])
 
 
-def _determined(opens, size):
+def _determined(rows, size):
     """Return an orthonormal basis of the directions that none of the open ones moves."""
-    rows = np.concatenate(opens) if opens else np.zeros((0, size))
-    if not size or not len(rows):
+    if not rows.size:
         return np.eye(size)
     _, singular, vectors = np.linalg.svd(rows, full_matrices=True)
     rank = int(np.sum(singular > 1e-5 * max(singular.max(initial=0.0), 1.0)))
@@ -405,7 +404,7 @@ def _in_one_gauge(opens, size):
     common, opens = np.zeros((0, size)), [_orthonormal(rows) for rows in opens]
     for own in opens:
         common = np.concatenate([common, _orthonormal(own - own @ common.T @ common, _TURNED)])
-    basis = _determined([common], size)
+    basis = _determined(common, size)
     along = (own.T @ np.linalg.pinv(common @ own.T) @ common for own in opens)
     return basis, [basis - basis @ way for way in along]
 

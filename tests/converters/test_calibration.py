@@ -159,10 +159,10 @@ def test_everything_else_is(node):
 
 def test_entries_of_one_name(node):
     for key, place, words in [
-        ("accuracy", None, "two columns of a table have the same name"),
+        ("accuracy", None, "column .* is given twice"),
         ("ties", 0, "'derotator.theta' is given twice"),
-        ("stages", None, "is given twice in a list of parameters"),
-        ("directions", None, "is given twice in a list of parameters"),
+        ("stages", None, "is given twice"),
+        ("directions", None, "is given twice"),
         ("priors", 0, "prior of 'derotator.retardance' is given twice"),
     ]:
         spoiled = copy.deepcopy(node)

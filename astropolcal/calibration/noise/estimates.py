@@ -19,7 +19,7 @@ from astropolcal.exceptions import FitError, ParameterError
 from astropolcal.observations.grid import MAD_TO_SIGMA
 from astropolcal.observations.observables import OBSERVABLES
 from astropolcal.observations.pointings import angle_or_zero
-from astropolcal.units import angle_to_rad, positive_number, to_unit
+from astropolcal.units import angle_to_rad, positive_number
 from astropolcal.words import check_choice
 
 __all__ = [
@@ -225,7 +225,7 @@ def noise_from_errors(measurement, *, gain=None, read_noise=0.0):
 # ---- replicates ---------------------------------------------------------------------------
 
 
-def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
+def noise_from_replicates(measurement, *, tolerance=0.1 * u.deg):
     r"""
     Return the noise from the scatter among data taken at the same settings.
 
@@ -241,8 +241,6 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     ----------
     measurement : Measurement
         The measurement.
-    vector : array_like, optional
-        Parameters for the residuals, by default the current ones; shape (n_free,).
     tolerance : `~astropy.units.Quantity`
         Largest difference of a position among replicates, 0 to 90 deg.
 
@@ -272,7 +270,7 @@ def noise_from_replicates(measurement, vector=None, *, tolerance=0.1 * u.deg):
     >>> int(noise_from_replicates(Measurement(charis.chain(), observations)).dof[0])
     8
     """
-    residuals = measurement.residuals(_vector(measurement, vector))
+    residuals = measurement.residuals()
     limit = angle_to_rad(tolerance, "tolerance")
     if limit.ndim or not 0 <= limit <= np.pi / 2:
         raise ParameterError(f"tolerance = {tolerance}; allowed is one angle from 0 to 90 deg")
@@ -316,18 +314,6 @@ def _states(observations, chain):
     return np.unique(told, axis=1, return_inverse=True)[1].ravel()
 
 
-def _vector(measurement, vector):
-    """Return a vector of free parameters, by default the current ones; refuse one of others."""
-    if vector is None:
-        return measurement.vector()
-    vector, size = to_unit(vector, None, "vector"), measurement.free.size
-    if vector.shape != (size,):
-        raise ParameterError(
-            f"vector of shape {vector.shape}; allowed is ({size},), one number a free parameter"
-        )
-    return vector
-
-
 def equal_axes(angle, tolerance):
     """Number axes (radian, modulo 180 deg) so that those of one number lie within a tolerance."""
     axis = np.mod(angle, np.pi)
@@ -352,7 +338,7 @@ _SAME_DEROTATOR = np.deg2rad(0.5)
 _SAME_PLATE = np.deg2rad(0.3)
 
 
-def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
+def noise_from_null_channel(measurement, *, null_model="constant"):
     r"""
     Return the noise from the double sum of normalized differences.
 
@@ -369,8 +355,6 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     ----------
     measurement : Measurement
         The measurement.
-    vector : array_like, optional
-        Parameters for the chain's own null, by default the current ones.
     null_model : {"constant", "smooth"}
         The mean over the plate angles at each derotator angle; or for each
         plate angle a curve over the derotator angle D,
@@ -405,7 +389,7 @@ def noise_from_null_channel(measurement, vector=None, *, null_model="constant"):
     """
     check_choice("null_model", null_model, _NULL_MODELS, FitError)
     _need_two_beams(measurement, "the null channel")
-    vector = _vector(measurement, vector)
+    vector = measurement.vector()
     datasets = zip(measurement.datasets, measurement.chains, strict=True)
     parts = [_null_scatter(part, chain, vector, null_model) for part, chain in datasets]
     if not any(freedom.any() for _, freedom in parts):
@@ -493,7 +477,7 @@ _SINGLE = OBSERVABLES["normalized_single_difference"]
 _TELLS = 0.19
 
 
-def noise_from_roughness(measurement, vector=None):
+def noise_from_roughness(measurement):
     r"""
     Return the stated errors, or more where single frames are rough along the wavelengths.
 
@@ -506,8 +490,6 @@ def noise_from_roughness(measurement, vector=None):
     ----------
     measurement : Measurement
         The measurement.
-    vector : array_like, optional
-        Parameters for the residuals, by default the current ones; shape (n_free,).
 
     Returns
     -------
@@ -536,7 +518,7 @@ def noise_from_roughness(measurement, vector=None):
     ('roughness', True)
     """
     _need_two_beams(measurement, "roughness of differences")
-    vector = _vector(measurement, vector)
+    vector = measurement.vector()
     sigmas, freedom = [], []
     for part in measurement.datasets:
         obs = part.observations

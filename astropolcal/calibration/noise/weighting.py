@@ -75,13 +75,13 @@ def _scales(measurement, residuals):
     return scale
 
 
-def outlying_data(calibration, limit=_FAR):
+def outlying_data(calibration):
     """
     Return the pairs of frames that are at odds with a calibration.
 
     The residuals of a pair, in units of the robust noise of its wavelength, are reduced to
     their median over the wavelengths, which is what a cloud, a satellite or a wrong angle
-    changes. A pair is at odds if this departs by more than ``limit`` robust standard deviations
+    changes. A pair is at odds if this departs by more than four robust standard deviations
     of all pairs of its dataset. It is at odds at one wavelength, as a cosmic ray does it, if its
     datum there departs by more than one and a half times as many.
 
@@ -89,8 +89,6 @@ def outlying_data(calibration, limit=_FAR):
     ----------
     calibration : Calibration
         A calibration with its data.
-    limit : float
-        In robust standard deviations.
 
     Returns
     -------
@@ -102,8 +100,6 @@ def outlying_data(calibration, limit=_FAR):
 
     Raises
     ------
-    ParameterError
-        If the limit is not above zero.
     CalibrationFileError
         If the calibration was read from a file, which holds no data.
 
@@ -115,8 +111,6 @@ def outlying_data(calibration, limit=_FAR):
     >>> len(outlying_data(cal))
     0
     """
-    if not limit > 0:
-        raise ParameterError(f"limit = {limit}; allowed are numbers above 0")
     live, rows, data = calibration.live_measurement(), [], []
     residuals = live.residuals()
     scales = _scales(live, residuals)
@@ -135,9 +129,9 @@ def outlying_data(calibration, limit=_FAR):
         for i, whole in enumerate(off / np.maximum(MAD_TO_SIGMA * np.median(off), least)):
             alone = members[i][np.argmax(size[members[i]])]
             times = size[alone] * tells
-            if max(whole, times / _ALONE) > limit:
+            if max(whole, times / _ALONE) > _FAR:
                 own, nm = members[i], np.nan
-                if not whole > limit:
+                if not whole > _FAR:
                     own, nm, whole = alone, 1e3 * live.wavelength[live.bins[alone]], times
                 frames = part.frames[groups[i]]
                 numbers = ", ".join(np.array(frame_names(part.observations.frames))[frames])
