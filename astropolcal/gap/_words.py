@@ -96,9 +96,8 @@ def share(value):
 
 def short_share(value):
     """Return a share as percent, for a column of a table; a dash if there is none."""
-    return (
-        "-" if value is None else share(value).replace("less than", "<").replace("more than", ">")
-    )
+    words = "-" if value is None else share(value)
+    return words.replace("less than", "<").replace("more than", ">")
 
 
 def change(old, new, digits=2):

@@ -486,12 +486,7 @@ class ChallengeResult:
     def __init__(self, records, settings):
         self.records, self.settings = list(records), dict(settings)
 
-    def of(self, *kinds, least=-np.inf, below=np.inf):
-        """Return the records of some kinds (by default all) in a range of SNR."""
-        known = [r for r in self.records if not kinds or r["kind"] in kinds]
-        return [r for r in known if least <= r["snr"] < below]
-
-    def rate(self, result, *kinds, **limits):
+    def rate(self, result, *kinds, least=-np.inf, below=np.inf):
         """
         Return the share of answers that are right, silent or wrong.
 
@@ -501,8 +496,8 @@ class ChallengeResult:
             ``"right"``, ``"silent"`` or ``"wrong"``.
         *kinds : str
             Of ``KINDS``; by default all.
-        **limits : float
-            ``least`` and ``below``, a range of the signal-to-noise ratio.
+        least, below : float
+            Range of the signal-to-noise ratio.
 
         Returns
         -------
@@ -510,7 +505,8 @@ class ChallengeResult:
             With the interval of Wilson (1927) at 68 %; NaN where there are none.
         count : int
         """
-        found = [record["result"] for record in self.of(*kinds, **limits)]
+        known = (one for one in self.records if not kinds or one["kind"] in kinds)
+        found = [one["result"] for one in known if least <= one["snr"] < below]
         return (*_wilson(found.count(result), len(found)), len(found))
 
     @property

@@ -191,11 +191,6 @@ class Diagnosis:
         return 100 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
     @property
-    def hidden_share(self):
-        """Share of the gap that what is left does not exclude (95 %), 1 where no cause is."""
-        return self.improved.hidden_share(self.nominal)
-
-    @property
     def hidden_percent(self):
         """Rms of what may be left of the gap in a single difference (95 %), in percent."""
         told = sum(channel.valid.sum() for channel in self.improved.problem.channels)

@@ -342,33 +342,32 @@ class GapProblem:
 
     # ---- fit -------------------------------------------------------------------------
 
-    def fit(self, start=None, rows=None, held=None, steps=_MAX_STEPS, share=_ARRIVED_SHARE):
+    def fit(self, start=None, rows=None, steps=_MAX_STEPS, share=_ARRIVED_SHARE):
         """Fit by damped Gauss-Newton steps within the bounds (Nielsen 1999, IMM-REP-1999-05).
 
         Damped steps follow valleys to second order (Transtrum & Sethna 2012, arXiv:1201.5885).
-        ``rows`` are those that take part, (n_rows,), ``held`` the coefficients that stay; a step
-        that lowers chi-square by less than ``share`` of it is the last.
+        ``rows`` are those that take part, (n_rows,); a step that lowers chi-square by less than
+        ``share`` of it is the last.
         """
         q = self._inside(self.start if start is None else start)
-        live = np.ones(self.size, dtype=bool) if held is None else ~held
         take = slice(None) if rows is None else rows
         residual, cost = self._cost(q, take)
-        converged, damping, slow = not live.any(), 0.0, False
-        longest = np.zeros(np.count_nonzero(live))
+        converged, damping, slow = not self.size, 0.0, False
+        longest = np.zeros(self.size)
         for _ in range(steps):
             # from where the model is not defined no step leads down
             if converged or not np.isfinite(cost):
                 break
-            slopes, *normal = self._normal(q, residual, take, live)
+            slopes, *normal = self._normal(q, residual, take)
             if not np.isfinite(normal[0]).all():
                 # the model has no derivative here
                 break
             longest, growth = np.maximum(longest, normal[-1]), 2
             while damping < _STUCK:
                 damped = damping * (longest / normal[-1]) ** 2
-                step, promised = self._step(q, live, *normal, damped)
+                step, promised = self._step(q, *normal, damped)
                 if damping > 0:
-                    step = self._bent(q, step, (residual, slopes, take, live), *normal, damped)
+                    step = self._bent(q, step, (residual, slopes, take), *normal, damped)
                 trial = np.clip(q + step, self.low, self.high)
                 there, new = self._cost(trial, take)
                 if np.isfinite(new) and new <= cost * (1 + 1e-12):
@@ -376,7 +375,7 @@ class GapProblem:
                 if damping == 0:
                     # what is short at an extremum, as half a wave is, is long beside it
                     with np.errstate(all="ignore"):
-                        *_, beside = self._normal(q + _SHORT * step, residual, take, live)
+                        *_, beside = self._normal(q + _SHORT * step, residual, take)
                     longest = np.maximum(longest, np.where(np.isfinite(beside), beside, 0.0))
                 damping, growth = max(growth * damping, _FIRST_DAMPING), 2 * growth
             else:
@@ -405,48 +404,43 @@ class GapProblem:
             residual = self.residual(q)[take]
         return residual, residual @ residual + np.sum(((q - self.centre) * self.tight) ** 2)
 
-    def _normal(self, q, residual, take, live):
+    def _normal(self, q, residual, take):
         """Return derivatives, normal equations of a step in columns of unit length, and lengths."""
         # rows of the transposed table are contiguous
-        slopes, tight = self.jacobian(q).T[:, take], self.tight[live]
-        slopes = (slopes if live.all() else slopes[live]).T
-        gram = slopes.T @ slopes + np.diag(tight**2)
-        target = slopes.T @ residual + tight**2 * (self.centre - q)[live]
+        slopes = self.jacobian(q).T[:, take].T
+        gram = slopes.T @ slopes + np.diag(self.tight**2)
+        target = slopes.T @ residual + self.tight**2 * (self.centre - q)
         scale = np.sqrt(np.diag(gram))
         # what moves the data by rounding alone has no length
         scale[scale <= np.finfo(float).eps * scale.max(initial=0.0)] = 1.0
         return slopes, gram / np.outer(scale, scale), target / scale, scale
 
-    def _step(self, q, live, gram, target, scale, damped):
+    def _step(self, q, gram, target, scale, damped):
         n = len(scale)
         triangle = _root(gram + (damped + _HOLD**2) * np.eye(n))
         wanted = solve_triangular(triangle, target, trans="T", check_finite=False) if n else target
-        low = (self.low[live] - q[live]) * scale
-        high = (self.high[live] - q[live]) * scale
+        low, high = (self.low - q) * scale, (self.high - q) * scale
         found = solve_triangular(triangle, wanted, check_finite=False) if n else wanted
         if np.any((found < low) | (found > high)):
             found = _within(triangle, wanted, low, high, found)
-        rows, room = self._walls[0][:, live] / scale, self._walls[1] - self._walls[0] @ q
+        rows, room = self._walls[0] / scale, self._walls[1] - self._walls[0] @ q
         if np.any(rows @ found > room + _AT_WALL):
             rows = np.concatenate([rows, np.eye(n), -np.eye(n)])
             found = _behind_walls(triangle, wanted, rows, np.concatenate([room, high, -low]))
-        step = np.zeros(self.size)
-        step[live] = found / scale
-        return step, found @ (2 * target - gram @ found)
+        return found / scale, found @ (2 * target - gram @ found)
 
     def _bent(self, q, step, seen, gram, _, scale, damped):
         """Return a damped step that follows the second derivative along it, within all walls."""
-        residual, slopes, take, live = seen
+        residual, slopes, take = seen
         ahead, _ = self._cost(q + _SHORT * step, take)
-        curvature = 2 / _SHORT * ((ahead - residual) / _SHORT + slopes @ step[live])
+        curvature = 2 / _SHORT * ((ahead - residual) / _SHORT + slopes @ step)
         if not np.isfinite(curvature).all():
             return step
         root = _root(gram + (damped + _HOLD**2) * np.eye(len(gram)))
         found = cho_solve((root, False), slopes.T @ curvature / scale, check_finite=False)
-        if np.linalg.norm(found) > _CURVED * np.linalg.norm(step[live] * scale):
+        if np.linalg.norm(found) > _CURVED * np.linalg.norm(step * scale):
             return step
-        bend = np.zeros(self.size)
-        bend[live] = found / scale / 2
+        bend = found / scale / 2
         rows, ends = self._walls
         # through no wall
         far, room = rows @ bend, ends + _AT_WALL - rows @ (q + step)

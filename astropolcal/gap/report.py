@@ -145,7 +145,7 @@ def _worked_out(diagnosis):
         "where": _where(diagnosis),
         "where_left": [] if same or noisy else [o for part in _located(improved) for o in part],
         "left_share": 0.0 if noisy else left,
-        "left_share_limit": diagnosis.hidden_share,
+        "left_share_limit": improved.hidden_share(nominal),
         "hidden_percent": diagnosis.hidden_percent,
         "causes": causes,
         "changes": runs.changes(diagnosis, causes) if len(names) > 1 else [],
@@ -631,10 +631,9 @@ def causes_table(diagnosis):
         rows.append((i, c.name, *told, *gaps))
     columns = {"rank": int, "effect": str, "place": str, "cannot_be_told_from": str}
     columns |= {"probability": float, "explained": float, "physical": bool}
-    gaps = dict.fromkeys(("gap_before", "gap_after"), u.percent)
-    columns |= dict.fromkeys(gaps, float)
-    kinds = list(columns.values())
-    return QTable(rows=rows or None, names=list(columns), dtype=kinds, units=gaps)
+    columns |= {"gap_before": float, "gap_after": float}
+    how = {"dtype": list(columns.values()), "units": {"gap_before": "%", "gap_after": "%"}}
+    return QTable(rows=rows or None, names=list(columns), **how)
 
 
 # ---- for the terminal ------------------------------------------------------------------------

@@ -7,8 +7,8 @@ import numpy as np
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.gap._words import is_determined, labels, share, shortened
-from astropolcal.gap.cells import places
-from astropolcal.gap.report import ANGLES, Fitted
+from astropolcal.gap.cells import own_name, places
+from astropolcal.gap.report import ANGLES, Fitted, to_dict
 from astropolcal.gap.residuals import frame_blocks
 from astropolcal.optics.perturbations import GENERATORS, Dependence
 from astropolcal.plotting import _style as st
@@ -305,7 +305,7 @@ def plot_cause_map(diagnosis, *, figure=None):
         named = []
         for place in rows:
             head, _, optic = place.partition(":")
-            label = words.get(head, place).format(_STAGES.get(optic, optic))
+            label = words.get(head, place).format(own_name(optic))
             named.append(textwrap.fill(label, 16))
         axes.set_yticks(range(len(rows)), labels=named)
         axes.tick_params(length=0, labelsize=9.5)
@@ -318,7 +318,6 @@ def plot_cause_map(diagnosis, *, figure=None):
     return figure
 
 
-_STAGES = {"hwp": "half-wave plate"}
 # columns of the map
 _OTHER = "other"
 _FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
@@ -374,7 +373,7 @@ def _place_of(effect, chains):
     return place if place in known else where.in_front_of(roles)
 
 
-def plot_effect_sizes(diagnosis, effect, *, figure=None):
+def plot_effect_sizes(diagnosis, effect):
     """Draw the fitted size of a cause, by its name, with its errors.
 
     One panel for what it depends on, if that is a cell that changes from frame to frame: the size
@@ -383,21 +382,16 @@ def plot_effect_sizes(diagnosis, effect, *, figure=None):
     """
     names = [cause.name for cause in diagnosis.causes]
     check_choice("cause", effect, names, ParameterError)
-    if diagnosis.content is None:
-        sizes = Fitted(diagnosis.improved).sizes(effect)
-    else:
-        sizes = diagnosis.content["causes"][names.index(effect)]["size"]
+    entry = to_dict(diagnosis)["causes"][names.index(effect)]
     cause, model = diagnosis.causes[names.index(effect)], diagnosis.improved
-    sizes = {name: size for name, size in sizes.items() if _varies(size["value"])}
+    sizes = {name: size for name, size in entry["size"].items() if _varies(size["value"])}
     dependence = _curve(model, cause)
     panels = [None, *sizes] if dependence else list(sizes)
     if not panels:
         raise ParameterError(f"effect = {effect!r} has no size that depends on anything")
-    keys = [p.name for p in model.added.get(effect) or ()]
-    cell = cause.cell.to_dict() if cause.cell else None
-    words = dict(zip(keys, labels({"size": keys, "cell": cell}), strict=True))
+    words = dict(zip(entry["size"], labels(entry), strict=True))
     columns = min(len(panels), 2)
-    with st.canvas(figure, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
+    with st.canvas(None, 4.9 * columns + 0.6, 0.4 + 2.6 * -(-len(panels) // 2)) as figure:
         for axes, name in zip(st.grid(figure, len(panels), columns)[0], panels, strict=True):
             if name is None:
                 _curve_panel(axes, model, effect, dependence)
@@ -485,8 +479,7 @@ def _curve_panel(axes, model, effect, dependence):
         axes.plot(x, value, color=st.BLUE)
         foot = np.full(len(given), 0.02)
         axes.plot(given, foot, "|", color=st.GREY, transform=axes.get_xaxis_transform())
-    stage = dependence.parts[1] if len(dependence.parts) > 1 else ""
-    stage = _STAGES.get(stage, stage)
+    stage = own_name(dependence.parts[1]) if len(dependence.parts) > 1 else ""
     known = {
         "harmonic": f"angle of the {stage} (deg)",
         "direction": f"last move of the {stage}",

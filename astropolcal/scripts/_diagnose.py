@@ -89,10 +89,9 @@ def run(arguments):
     # first the files: a reader of our words may have gone in the meantime
     _write(diagnosis, content, arguments, instrument)
     following = [exposure(entry, content["causes"]) for entry in content["next_observations"][:1]]
-    found = {"none": "calibrate with this model"}
     keep = "--save FILE.asdf calibrates with what was found"
     keep = f"correct measurements with {arguments.save}" if arguments.save else keep
-    found |= dict.fromkeys(("named", "located"), keep)
+    found = {"none": "calibrate with this model", "named": keep, "located": keep}
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
     told = [_CORRECT] if content["misread"] and content["causes"][0]["probability"] >= 0.5 else told
     saved = not content["misread"] and arguments.save

@@ -1,5 +1,5 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
-"""Fits of a gap problem: bounds, priors, held coefficients, left-out rows, errors."""
+"""Fits of a gap problem: bounds, priors, left-out rows, errors."""
 
 import gap_data as data
 import numpy as np
@@ -101,19 +101,6 @@ def test_no_step_is_no_convergence(plain):
     found = plain.fit(steps=0)
     assert not found.converged
     np.testing.assert_array_equal(found.coefficients, np.clip(plain.start, plain.low, plain.high))
-
-
-def test_held_coefficients_stay(plain):
-    held = np.zeros(plain.size, dtype=bool)
-    held[plain.slices[RETARDANCE]] = True
-    start = plain.start + 0.02
-    found = plain.fit(start, held=held)
-    clipped = np.clip(start, plain.low, plain.high)
-    np.testing.assert_array_equal(found.coefficients[held], clipped[held])
-    assert np.all(found.coefficients[~held] != clipped[~held])
-    everything = plain.fit(start, held=np.ones(plain.size, dtype=bool))
-    assert everything.converged
-    np.testing.assert_array_equal(everything.coefficients, clipped)
 
 
 def test_rows_that_are_left_out_have_no_say(plain, fitted):
@@ -218,9 +205,8 @@ def test_a_step_within_bounds_is_that_of_bounded_least_squares(plain):
     matrix, target = rng.normal(size=(2 * n, n)), 3 * rng.normal(size=2 * n)
     narrow = problem_of(like=plain)
     narrow.low, narrow.high = plain.start - 0.3, plain.start + 0.3
-    live = np.ones(n, dtype=bool)
     normal = matrix.T @ matrix, matrix.T @ target, np.ones(n)
-    step, promised = narrow._step(plain.start, live, *normal, 0.0)
+    step, promised = narrow._step(plain.start, *normal, 0.0)
     expected = lsq_linear(matrix, target, (-0.3, 0.3), tol=1e-12).x
     np.testing.assert_allclose(step, expected, atol=1e-4)
     left = matrix @ step - target

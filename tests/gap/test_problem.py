@@ -73,14 +73,6 @@ def test_fit_stays_within_the_bounds():
     assert np.all(fit.coefficients >= problem.low)
 
 
-def test_held_coefficients_stay(problem):
-    held = np.zeros(problem.size, dtype=bool)
-    held[problem.slices["hwp.theta"]] = True
-    start = problem.start + 1e-3
-    fit = problem.fit(np.clip(start, problem.low, problem.high), held=held)
-    assert fit.coefficients[held] == np.clip(start, problem.low, problem.high)[held]
-
-
 def test_lamp_is_no_gap():
     """Drift and flicker of the lamp leave chi-square what it is."""
     for seed in [1, 2]:

@@ -247,7 +247,7 @@ def sized(sizes, parameters, factor=1.0):
     found = diagnosis(cause("beam_gain"))
     model = SimpleNamespace(problem=problem, added={"beam_gain": parameters}, chains=[])
     found.nominal = found.improved = model
-    found.content = {"causes": [{"size": sizes}]}
+    found.content = {"causes": [{"size": sizes, "cell": None}]}
     return found
 
 
@@ -323,11 +323,13 @@ def test_a_cell_is_drawn_over_what_it_depends_on():
         own = cause(cell)
         own.effect = CellEffect(cell, 0)
         improved = model.with_effect(own.effect)
-        found = SimpleNamespace(nominal=model, improved=improved, causes=[own], content=None)
+        entry = {"size": Fitted(improved).sizes(own.name), "cell": cell.to_dict()}
+        found = SimpleNamespace(nominal=model, improved=improved, causes=[own])
+        found.content = {"causes": [entry]}
         (axes,) = plot_effect_sizes(found, own.name).axes
         assert axes.get_xlabel() == label
         assert "deg" in axes.get_ylabel()
-        value = next(iter(Fitted(improved).sizes(own.name).values()))["value"][0]
+        value = next(iter(entry["size"].values()))["value"][0]
         if dependence == "time":
             curve = next(line for line in axes.lines if len(line.get_xdata()) == 400)
             np.testing.assert_allclose(curve.get_ydata()[[0, -1]], [-value, value], rtol=1e-6)
