@@ -21,7 +21,7 @@ from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, Candidate, preference, scan
-from astropolcal.gap.cells import Cell, alike, count_runs
+from astropolcal.gap.cells import Cell, alike, count_runs, in_other_frame
 from astropolcal.gap.courses import courses
 from astropolcal.gap.shrinkage import foreseen, stability
 
@@ -783,15 +783,36 @@ def _unlisted(base, best, stable, instead):
 
 def _grouped(task, best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
-    found = []
+    found, turned = [], _turned(task, best)
     for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
-        members = _members(one, scans[one.name], _refits(task, best, one))
+        rivals = turned.get(one.name, ())
+        members = _members(one, scans[one.name], _refits(task, best, one), rivals)
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
         chance *= float((1 - unlisted) * share)
         alone = scans[one.name].by_run(members[0][0])
         found.append(Group(members, chance, lowered, share, alone))
+    return found
+
+
+def _turned(task, best):
+    """Return what components of one optic are in its other frame, by name, with weights.
+
+    Neither of the two is anything there without the other.
+    """
+    found, temper = {}, _temper(best)
+    stages = {leaf.name: leaf.stage for chain in task.base.trains for leaf in leaves(chain)}
+    cells = [one for one in best.chosen if one.cell is not None and not one.is_named]
+    for pair in combinations(cells if len(best.chosen) <= _MERGED[1] else (), 2):
+        others = [one for one in best.chosen if one not in pair]
+        for twins in in_other_frame([one.cell for one in pair], stages):
+            new = [replace(one, cell=cell) for one, cell in zip(pair, twins, strict=True)]
+            state = task.quickly([*others, *new], best.model)
+            weight = np.exp(min(state.evidence(temper) - best.evidence(temper), 0.0))
+            if weight >= _ALIAS and all(state.model.is_physical(one.name) for one in new):
+                for one, twin in zip(pair, new, strict=True):
+                    found.setdefault(one.name, []).append((twin, weight))
     return found
 
 
@@ -835,8 +856,11 @@ def _as_free(chosen, beside):
     return [free.get(one.name, one) for one in rivals]
 
 
-def _members(chosen, beside, loss):
-    """Return the chosen candidate and its aliases, with probabilities that sum to one."""
+def _members(chosen, beside, loss, turned=()):
+    """Return the chosen candidate and its aliases, with probabilities that sum to one.
+
+    Those that are known to be ``turned``, with their weights, are among the aliases.
+    """
     rivals = _as_free(chosen, beside)
     seen = own = next((one for one in rivals if one.name == chosen.name), chosen)
     # fits in full were compared already: nothing that is listed is better than what was chosen
@@ -872,6 +896,8 @@ def _members(chosen, beside, loss):
             weight = max(weight, np.exp(min(one.evidence - seen.evidence, 0.0)))
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
+    for one, weight in turned:
+        weights.setdefault(one.name, (one, weight))
     total = sum(weight for _, weight in weights.values())
     (_, most), *others = weights.values()
     # of one probability the best first; of what does the same, rounding alone would tell which is
