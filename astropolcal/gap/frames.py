@@ -267,7 +267,7 @@ def _faults(look, accused, n_frames):
 
 
 def _of_a_while(look, found):
-    """Return the faults; of frames in a row no angle is to blame, but where a stage stood still.
+    """Return the faults; of frames in a row no angle is to blame, unless a stage did not move.
 
     Something may have changed for a while: light that arrives turned looks like a half-wave plate
     that is, and that each move of a stage failed is no more probable.

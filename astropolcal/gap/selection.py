@@ -22,7 +22,7 @@ from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, Candidate, preference, scan
 from astropolcal.gap.cells import Cell, alike, count_runs, in_other_frame
-from astropolcal.gap.courses import courses
+from astropolcal.gap.courses import alike_courses, real_courses
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
@@ -204,7 +204,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = _alike_courses(base, _real_courses(base, base))
+        seen = alike_courses(base, real_courses(base, base, REMAINDER))
         return Selection([], base, first, 0.0, [_errors(base, groups)], seen)
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
@@ -226,7 +226,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = _real_courses(best.model, base)
+    rivals = real_courses(best.model, base, REMAINDER)
     # what changed between runs has two causes, and one course in all of them: that is no evidence
     is_one = alike([one.cell for one in best.chosen]) == "optic"
     of_several = _ONE_COURSE * (runs < 2 and len(best.chosen) > 1 and not is_one)
@@ -238,26 +238,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     unlisted = _unlisted(base, best, stable, chance)
     found = _grouped(task, best, steps, scans, unlisted, stable)
     told = rivals if chance > _MAY_BE else []
-    return Selection(found, best.model, first, unlisted, history, _alike_courses(base, told))
-
-
-def _real_courses(model, base):
-    """Return the courses that noise does not make, of so many looks."""
-    found = courses(model, base)
-    return [one for one in found if one.p_value * len(found) < REMAINDER]
-
-
-def _alike_courses(base, found):
-    """Return the best courses, which the data do not tell apart; first simple ones of no stage."""
-    near = [2 * np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
-    best = {}
-    for one, noise in zip(found, near, strict=True):
-        if one.gained > found[0].gained - noise:
-            # the best of those of one place and kind
-            best.setdefault((one.place, one.kind), one)
-    for one in best.values():
-        one.find_shape(base)
-    return sorted(best.values(), key=lambda one: not one.shape or bool(one.stage))
+    return Selection(found, best.model, first, unlisted, history, alike_courses(base, told))
 
 
 def _errors(model, groups):
@@ -785,8 +766,7 @@ def _grouped(task, best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
     found, turned = [], _turned(task, best)
     for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
-        rivals = turned.get(one.name, ())
-        members = _members(one, scans[one.name], _refits(task, best, one), rivals)
+        members = _members(one, scans[one.name], _refits(task, best, one), turned[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
@@ -801,18 +781,17 @@ def _turned(task, best):
 
     Neither of the two is anything there without the other.
     """
-    found, temper = {}, _temper(best)
+    found, temper = {one.name: [] for one in best.chosen}, _temper(best)
     stages = {leaf.name: leaf.stage for chain in task.base.trains for leaf in leaves(chain)}
     cells = [one for one in best.chosen if one.cell is not None and not one.is_named]
     for pair in combinations(cells if len(best.chosen) <= _MERGED[1] else (), 2):
-        others = [one for one in best.chosen if one not in pair]
         for twins in in_other_frame([one.cell for one in pair], stages):
             new = [replace(one, cell=cell) for one, cell in zip(pair, twins, strict=True)]
-            state = task.quickly([*others, *new], best.model)
+            state = task.quickly([*(o for o in best.chosen if o not in pair), *new], best.model)
             weight = np.exp(min(state.evidence(temper) - best.evidence(temper), 0.0))
             if weight >= _ALIAS and all(state.model.is_physical(one.name) for one in new):
                 for one, twin in zip(pair, new, strict=True):
-                    found.setdefault(one.name, []).append((twin, weight))
+                    found[one.name].append((twin, weight))
     return found
 
 
@@ -896,8 +875,7 @@ def _members(chosen, beside, loss, turned=()):
             weight = max(weight, np.exp(min(one.evidence - seen.evidence, 0.0)))
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
-    for one, weight in turned:
-        weights.setdefault(one.name, (one, weight))
+    weights |= {one.name: (one, weight) for one, weight in turned}
     total = sum(weight for _, weight in weights.values())
     (_, most), *others = weights.values()
     # of one probability the best first; of what does the same, rounding alone would tell which is
