@@ -228,6 +228,27 @@ def alike(cells):
     return "action" if (one.place, one.kind) == (other.place, other.kind) else ""
 
 
+def in_other_frame(cells, stages):
+    """Return pairs of cells that two components of an optic may be in its other frame.
+
+    What turns n times with a stage turns n - 2 or n + 2 times in the frame of the optic on it, and
+    the other way round; ``stages`` are those of optics, by name.
+    """
+    one, other = cells
+    head, _, optic = one.place.partition(":")
+    text, run = split_run(one.dependence)
+    word, stage, number = (*text.split(":"), "", "")[:3]
+    axes = {cell.kind.rpartition("_")[2] for cell in cells}
+    if alike(cells) != "optic" or one.place != other.place or axes != {"h", "d"}:
+        return []
+    if run is not None or word != "harmonic" or stages.get(optic) != stage:
+        return []
+    place = f"{'after' if head == 'in' else 'in'}:{optic}"
+    turns = sorted({abs(int(number) - 2), int(number) + 2} & set(_HARMONICS))
+    patterns = [f"harmonic:{stage}:{n}" for n in turns]
+    return [[replace(c, place=place, dependence=pattern) for c in cells] for pattern in patterns]
+
+
 # ---- places ------------------------------------------------------------------------------------
 
 

@@ -274,6 +274,25 @@ def courses(model, base):
     return list(best.values())
 
 
+def real_courses(model, base, least):
+    """Return the courses that noise makes with less than a probability, of so many looks."""
+    found = courses(model, base)
+    return [one for one in found if one.p_value * len(found) < least]
+
+
+def alike_courses(base, found):
+    """Return the best courses, which the data do not tell apart; first simple ones of no stage."""
+    near = [2 * np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
+    best = {}
+    for one, noise in zip(found, near, strict=True):
+        if one.gained > found[0].gained - noise:
+            # the best of those of one place and kind
+            best.setdefault((one.place, one.kind), one)
+    for one in best.values():
+        one.find_shape(base)
+    return sorted(best.values(), key=lambda one: not one.shape or bool(one.stage))
+
+
 def _left(without, course):
     """Return the mean square that a course leaves of a model to first order."""
     return (without.chi2 - course.lowered) / max(without.freedom - course.freedom, 1)

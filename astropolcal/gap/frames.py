@@ -55,6 +55,8 @@ _MOST, _LEAST_MOST = 0.05, 2
 # where a fit is not down to the noise so much of the excess has to be gone, and the accused have to
 # stand so far above the others
 _GONE, _APART = 0.8, 10.0
+# ends of what may last a while
+_FOR_A_WHILE = (" angle", "one beam", "unknown")
 # one angle of a group explains its frames if so little is left of them
 _LEFT = 0.01
 # single data that are so many robust standard deviations off what the others of their frame and
@@ -261,8 +263,27 @@ def _faults(look, accused, n_frames):
         if other is not None and (other not in found or found[other].what != "exchanged"):
             trial = Trial("exchanged", 0.0, 0.0, partner=fault.place[1])
             found[other] = _fault(look.problem, other, trial, fault.evidence, fault.probability)
-    found = _of_groups(look, list(found.values()), scatter)
+    found = _of_groups(look, _of_a_while(look, list(found.values())), scatter)
     return sorted(found, key=_order)
+
+
+def _of_a_while(look, found):
+    """Return the faults; of frames in a row no angle is to blame, unless a stage did not move.
+
+    Something may have changed for a while: light that arrives turned looks like a half-wave plate
+    that is, and that each move of a stage failed is no more probable.
+    """
+    off = {one.place: one.what for one in found if one.what.endswith(_FOR_A_WHILE)}
+    for fault in found:
+        (i, f), stage = fault.place, fault.what.removesuffix(" angle")
+        near = [k for k in (f - 1, f + 1) if (i, k) in off]
+        if stage == fault.what or look.problem.channels[i].groups is not None:
+            continue
+        stood = np.atleast_1d(look.problem.datasets[i]._given[stage])
+        if any(stood[k] != stood[f] or off[i, k] != fault.what for k in near):
+            fault.what, fault.value, fault.error = "unknown", None, None
+            fault.words += ", or something else changed for a while"
+    return found
 
 
 def _order(fault):

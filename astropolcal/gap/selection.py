@@ -21,8 +21,8 @@ from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, Candidate, preference, scan
-from astropolcal.gap.cells import Cell, alike, count_runs
-from astropolcal.gap.courses import courses
+from astropolcal.gap.cells import Cell, alike, count_runs, in_other_frame
+from astropolcal.gap.courses import alike_courses, real_courses
 from astropolcal.gap.shrinkage import foreseen, stability
 
 __all__ = []
@@ -204,7 +204,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
         best = _search(replace(task, library=[]), best, first, _MOST_TOGETHER * runs)
     if not best.chosen:
         task.say("one perturbation of any course")
-        seen = _alike_courses(base, _real_courses(base, base))
+        seen = alike_courses(base, real_courses(base, base, REMAINDER))
         return Selection([], base, first, 0.0, [_errors(base, groups)], seen)
     if first.probes.has_more_steps:
         # those between the steps of the first scan, which were found since
@@ -226,7 +226,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     best, steps, history = _checked(task, best)
     stable = stability(best.model, groups, max(1.0, best.model.mean_square))
     task.say("one perturbation of any course")
-    rivals = _real_courses(best.model, base)
+    rivals = real_courses(best.model, base, REMAINDER)
     # what changed between runs has two causes, and one course in all of them: that is no evidence
     is_one = alike([one.cell for one in best.chosen]) == "optic"
     of_several = _ONE_COURSE * (runs < 2 and len(best.chosen) > 1 and not is_one)
@@ -238,26 +238,7 @@ def select(base, library, groups, say, *, cells=True, changes=False, most=_MOST)
     unlisted = _unlisted(base, best, stable, chance)
     found = _grouped(task, best, steps, scans, unlisted, stable)
     told = rivals if chance > _MAY_BE else []
-    return Selection(found, best.model, first, unlisted, history, _alike_courses(base, told))
-
-
-def _real_courses(model, base):
-    """Return the courses that noise does not make, of so many looks."""
-    found = courses(model, base)
-    return [one for one in found if one.p_value * len(found) < REMAINDER]
-
-
-def _alike_courses(base, found):
-    """Return the best courses, which the data do not tell apart; first simple ones of no stage."""
-    near = [2 * np.sqrt(2 * max(one.freedom, found[0].freedom)) for one in found]
-    best = {}
-    for one, noise in zip(found, near, strict=True):
-        if one.gained > found[0].gained - noise:
-            # the best of those of one place and kind
-            best.setdefault((one.place, one.kind), one)
-    for one in best.values():
-        one.find_shape(base)
-    return sorted(best.values(), key=lambda one: not one.shape or bool(one.stage))
+    return Selection(found, best.model, first, unlisted, history, alike_courses(base, told))
 
 
 def _errors(model, groups):
@@ -783,15 +764,34 @@ def _unlisted(base, best, stable, instead):
 
 def _grouped(task, best, steps, scans, unlisted, stable):
     """Return the causes with their alias groups and probabilities."""
-    found = []
+    found, turned = [], _turned(task, best)
     for one, (before, after) in zip(best.chosen, pairwise(steps), strict=True):
-        members = _members(one, scans[one.name], _refits(task, best, one))
+        members = _members(one, scans[one.name], _refits(task, best, one), turned[one.name])
         chance = 1 / (1 + np.exp(min(ENOUGH - members[0][0].evidence, 50.0)))
         lowered = max(before.chi2 - after.chi2, 0.0)
         share = stable.get(one.name, 1.0)
         chance *= float((1 - unlisted) * share)
         alone = scans[one.name].by_run(members[0][0])
         found.append(Group(members, chance, lowered, share, alone))
+    return found
+
+
+def _turned(task, best):
+    """Return what components of one optic are in its other frame, by name, with weights.
+
+    Neither of the two is anything there without the other.
+    """
+    found, temper = {one.name: [] for one in best.chosen}, _temper(best)
+    stages = {leaf.name: leaf.stage for chain in task.base.trains for leaf in leaves(chain)}
+    cells = [one for one in best.chosen if one.cell is not None and not one.is_named]
+    for pair in combinations(cells if len(best.chosen) <= _MERGED[1] else (), 2):
+        for twins in in_other_frame([one.cell for one in pair], stages):
+            new = [replace(one, cell=cell) for one, cell in zip(pair, twins, strict=True)]
+            state = task.quickly([*(o for o in best.chosen if o not in pair), *new], best.model)
+            weight = np.exp(min(state.evidence(temper) - best.evidence(temper), 0.0))
+            if weight >= _ALIAS and all(state.model.is_physical(one.name) for one in new):
+                for one, twin in zip(pair, new, strict=True):
+                    found[one.name].append((twin, weight))
     return found
 
 
@@ -835,8 +835,11 @@ def _as_free(chosen, beside):
     return [free.get(one.name, one) for one in rivals]
 
 
-def _members(chosen, beside, loss):
-    """Return the chosen candidate and its aliases, with probabilities that sum to one."""
+def _members(chosen, beside, loss, turned=()):
+    """Return the chosen candidate and its aliases, with probabilities that sum to one.
+
+    Those that are known to be ``turned``, with their weights, are among the aliases.
+    """
     rivals = _as_free(chosen, beside)
     seen = own = next((one for one in rivals if one.name == chosen.name), chosen)
     # fits in full were compared already: nothing that is listed is better than what was chosen
@@ -872,6 +875,7 @@ def _members(chosen, beside, loss):
             weight = max(weight, np.exp(min(one.evidence - seen.evidence, 0.0)))
         if weight >= _ALIAS:
             weights[one.name] = (one, weight)
+    weights |= {one.name: (one, weight) for one, weight in turned}
     total = sum(weight for _, weight in weights.values())
     (_, most), *others = weights.values()
     # of one probability the best first; of what does the same, rounding alone would tell which is

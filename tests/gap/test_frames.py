@@ -92,6 +92,16 @@ def test_angles_that_do_as_well_are_told():
         assert "at 47.477 or 42.523 deg" in fault.words
 
 
+def test_angles_of_frames_in_a_row_may_be_something_else():
+    """Light that arrives turned for a while looks like a plate that is."""
+    frames = table()
+    frames["hwp_true"] = frames["hwp"] + np.where(np.isin(np.arange(N), (18, 19)), 0.7, 0) * u.deg
+    faults = harmful(found(observed(frames)))
+    assert sorted(fault.frame for fault in faults) == [18, 19]
+    assert {fault.what for fault in faults} == {"unknown"}
+    assert all("half-wave plate at" in fault.words for fault in faults)
+
+
 def test_exchanged_frames_are_named_with_each_other():
     for one, other in ((12, 13), (3, 40)):
         faults = found(observed(exchanged(one, other)))

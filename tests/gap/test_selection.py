@@ -345,6 +345,23 @@ def test_two_components_that_drift_together_are_one_optic():
 
 
 @pytest.mark.slow
+def test_an_axis_that_turns_is_told_in_the_other_frame_too():
+    """A beam that circles on a mirror downstream turns its axis as an optic on the stage could."""
+    setup, own = SETUPS["charis"](), "harmonic:derotator:1"
+    axis = {
+        place: [Cell(f"{place}:derotator", f"diattenuation_{kind}", own) for kind in "hd"]
+        for place in ("in", "after")
+    }
+    setup.truth = setup.with_cell(axis["after"][0], 0.01, 0.0)
+    found = chosen(setup, setup.observed(setup.with_cell(axis["after"][1], 0.0, 0.01), seed=2))
+    assert len(found.groups) == 2
+    for group in found.groups:
+        assert {f"{cells[0].place}/{group.best.cell.kind}/{own}" for cells in axis.values()} <= set(
+            names(group)
+        )
+
+
+@pytest.mark.slow
 def test_a_bright_lamp_shows_what_is_far_smaller_than_usual():
     """Of a static retarder of 0.05 deg: sizes that data tell are no reason against a cause."""
     charis, sources = instruments.get("charis"), ("polarized", "unpolarized")
