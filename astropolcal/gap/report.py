@@ -23,6 +23,7 @@ from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
 from astropolcal.calibration.fit.calibrate import standing_at
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.result.verdict import what_differs
 from astropolcal.calibration.uncertainty.covariance import covariance_along
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
@@ -160,6 +161,10 @@ def _worked_out(diagnosis):
     }
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content, len(names) > 1), *runs.paragraph(content, names, asked)]
+    if asked and diagnosis.verdict == "unexplained" and nominal.calibration:
+        # of errors that all data at a setting share no cause is sure; how residuals scatter is
+        told = what_differs(nominal.calibration.calibration())
+        words += [f"Measured by how the residuals of all runs scatter, {one}." for one in told]
     if misread and causes[0]["probability"] >= 0.5:
         # before all optics, and before what else is not known
         words.insert(0, _words.correct(causes[0]))
