@@ -263,7 +263,8 @@ class Dataset:
     def along_stage(self, chain, sweep, stage):
         """Return the derivative of the data to the angle of a stage, per radian, (n_data,)."""
         new = copy.copy(self)
-        new.n_free, new._live = 1, [
+        new.n_free = 1
+        new._live = [
             ((i, leaf.param_names.index("theta")), 0, leaf.stage_sign, 0.0)
             for i, leaf in enumerate(leaves(chain))
             if leaf.stage == stage and "theta" in leaf.param_names

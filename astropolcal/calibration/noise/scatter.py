@@ -226,8 +226,7 @@ class Scatter:
             self.slopes = np.column_stack([self.slopes, beside])
         groups = leave_out_groups(measurement)
         self.parts = [
-            self._part(i, groups, residuals, leverage)
-            for i in range(len(measurement.datasets))
+            self._part(i, groups, residuals, leverage) for i in range(len(measurement.datasets))
         ]
         for part in self.parts:
             part.shares = self._shares(part, residuals[part.rows])
