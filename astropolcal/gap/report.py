@@ -23,6 +23,7 @@ from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
 from astropolcal.calibration.fit.calibrate import standing_at
 from astropolcal.calibration.identifiability.linearized import ranked
+from astropolcal.calibration.result.verdict import what_differs
 from astropolcal.calibration.uncertainty.covariance import covariance_along
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
@@ -160,12 +161,23 @@ def _worked_out(diagnosis):
     }
     asked = diagnosis.settings.get("changes", False)
     words = [*_words.sentences(content, len(names) > 1), *runs.paragraph(content, names, asked)]
+    words += _scattered(diagnosis) if asked else []
     if misread and causes[0]["probability"] >= 0.5:
         # before all optics, and before what else is not known
         words.insert(0, _words.correct(causes[0]))
     if diagnosis.settings.get("fails") and diagnosis.verdict == "unexplained":
         words.insert(0, _words.fails(diagnosis.settings["fails"]))
     return plain(content | {"sentences": words})
+
+
+def _scattered(diagnosis):
+    """Say what differs between runs where causes do not explain the gap.
+
+    Of errors that all data at a setting share no cause is sure; how residuals scatter is.
+    """
+    made = diagnosis.nominal.calibration
+    told = what_differs(made.calibration()) if diagnosis.verdict == "unexplained" and made else []
+    return [f"Measured by how the residuals of all runs scatter, {one}." for one in told]
 
 
 def _frames(diagnosis):

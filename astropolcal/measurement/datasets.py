@@ -260,6 +260,17 @@ class Dataset:
         out = self.observable.gathered(out, right, left) if own else out
         return out.reshape(self.n_free, -1) if self._all_valid else out[:, self.valid]
 
+    def along_stage(self, chain, sweep, stage):
+        """Return the derivative of the data to the angle of a stage, per radian, (n_data,)."""
+        new = copy.copy(self)
+        new.n_free = 1
+        new._live = [
+            ((i, leaf.param_names.index("theta")), 0, leaf.stage_sign, 0.0)
+            for i, leaf in enumerate(leaves(chain))
+            if leaf.stage == stage and "theta" in leaf.param_names
+        ]
+        return new.jacobian(sweep)[0]
+
 
 def _check_fit(chain, observations, observable):
     """Refuse a table whose beams or states are not those of the chain."""

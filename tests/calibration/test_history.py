@@ -111,7 +111,7 @@ def test_change_is_found_where_it_is(years):
     assert len(table) == 2 * 5
     for row in table:
         changed = row["what"] in ("all", "derotator") and row["before"] == "run1"
-        assert (row["sigma"] > 15) == changed, row
+        assert (row["sigma"] > 5) == changed, row
         if not changed:
             assert row["sigma"] < 3.5
     words = str(significance(years[1:], ["derotator"]))

@@ -11,7 +11,9 @@ data as independent are too small then. Here the residuals of each dataset have 
 S is the scatter at each wavelength. C is the correlation of pairs of frames: of a pair with itself,
 or of the pairs at one setting, where an error of Stokes q and u goes with :math:`\cos 4\theta` and
 :math:`\sin 4\theta` of the half-wave plate. L is that of wavelengths: none, over a tenth of their
-logarithm, all, or that of the principal components of the errors at the settings. The shares
+logarithm, all, or that of the principal components of the errors at the settings. Beside these, a
+stage may stand beside the angle of the table at each setting, which moves all pairs and wavelengths
+there along the derivative to that angle: what turns q and u says little of their size. The shares
 :math:`\tau` are those for which products of residuals have the values that are found, after what
 the fit took away (MINQUE: Rao 1971, J. Multivariate Anal. 1, 257,
 doi:10.1016/0047-259X(71)90001-7).
@@ -110,9 +112,9 @@ _LEAST_FREEDOM = 1.0
 # fewer settings do not tell an error of theirs from the parameters
 _FEWEST_SETTINGS = 3
 # errors that rest on n settings, of the derotator for example, are by chance too small where
-# runs seem to differ: their variance counts 1 + 8/n times there. Of 68 series of 7 equal runs with
-# 4 to 14 settings, and hidden errors of these or of frames, 24 were said to change without it, and
-# 4 are
+# runs seem to differ: their variance counts 1 + 8/n times there. Of 44 series of 7 equal runs with
+# stages that stop beside the table's angle at each of 4 to 14 settings, 7 were said to change
+# without it, all with 4 settings, and 4 are
 _BY_CHANCE = 8.0
 # shares below so many times their error under independence count as chance
 _CHANCE = 2.0
@@ -136,6 +138,10 @@ class _Part:
     patterns: np.ndarray
     kernels: tuple
     amplitude: np.ndarray
+    #: Which pair is at which setting, (n_pairs, n_settings).
+    member: np.ndarray
+    #: How the angle of each stage shows in the pairs at wavelengths, of mean square one.
+    stages: tuple = ()
     shares: np.ndarray = None
     #: Which components residuals can tell at all.
     told: np.ndarray = None
@@ -159,13 +165,19 @@ class _Part:
         for together, kernel in self.components():
             before = seen if together else dense
             yield before, kernel @ before
+        for stage in self.stages:
+            off = self.member.T @ np.einsum("pw,pwk->pk", stage, dense)
+            yield off[None], off[None]
 
     def applied(self, columns):
         """Return the matrix of each component times columns."""
-        for (together, _), (_, behind) in zip(self.components(), self.halves(columns), strict=True):
+        halves = self.halves(columns)
+        for (together, _), (_, behind) in zip(self.components(), halves, strict=False):
             if together:
                 behind = np.tensordot(self.patterns, behind, axes=(1, 0))
             yield behind[self.pair, self.bin]
+        for stage, (off, _) in zip(self.stages, halves, strict=True):
+            yield stage[self.pair, self.bin, None] * (self.member @ off[0])[self.pair]
 
     def overlaps(self):
         """Return the traces of the products of two components, shape (n, n)."""
@@ -177,9 +189,16 @@ class _Part:
         crossed = np.hstack([q * q, u * u, np.sqrt(2) * q * u]).T @ present
         both, parts = crossed.T @ crossed, list(self.components())
         pairs = {(True, True): both, (False, False): alone}
-        return np.array(
-            [[np.sum(k * m * pairs.get((a, b), mixed)) for b, m in parts] for a, k in parts]
-        )
+        n = len(parts)
+        found = np.zeros((n + len(self.stages),) * 2)
+        found[:n, :n] = [
+            [np.sum(k * m * pairs.get((a, b), mixed)) for b, m in parts] for a, k in parts
+        ]
+        for j, stage in enumerate(self.stages, n):
+            # of what moves all data at a setting along one direction
+            off = stage[self.pair, self.bin, None] * self.member[self.pair]
+            found[j] = found[:, j] = [np.vdot(off, one) for one in self.applied(off)]
+        return found
 
 
 class Scatter:
@@ -192,17 +211,22 @@ class Scatter:
         told = (found._level, *(part.amplitude for part in found.parts))
         return found if all(np.isfinite(one).all() for one in told) else None
 
-    def __init__(self, measurement, weighting, whitened):
+    def __init__(self, measurement, weighting, whitened, beside=None):
+        """Start; ``beside`` is a direction of the data, of length one, that is fitted as well."""
         self.measurement = measurement
         weight = 1.0 if weighting.weight is None else weighting.weight
         self._level = 1.0 / weight * np.ones(measurement.n_data)
         residuals = measurement.residuals() * weight
+        leverage = whitened.leverage
         #: Derivatives of the data to the determined directions, each one standard error long.
         self.slopes = whitened.slopes
+        if beside is not None:
+            residuals = residuals - beside * (beside @ residuals)
+            leverage = leverage + beside**2
+            self.slopes = np.column_stack([self.slopes, beside])
         groups = leave_out_groups(measurement)
         self.parts = [
-            self._part(i, groups, residuals, whitened.leverage)
-            for i in range(len(measurement.datasets))
+            self._part(i, groups, residuals, leverage) for i in range(len(measurement.datasets))
         ]
         for part in self.parts:
             part.shares = self._shares(part, residuals[part.rows])
@@ -212,14 +236,18 @@ class Scatter:
         bins, group = self.measurement.bins[rows], groups[rows]
         log = np.log(self.measurement.wavelength)
         distance = np.abs(log[:, None] - log)
+        member = _members(dataset, group - group.min())
         part = _Part(
             rows,
             dataset.group_of_datum,
             bins,
-            _patterns(dataset, group - group.min()),
+            _patterns(dataset, member),
             (np.eye(log.size), np.exp(-distance / _LENGTH), np.ones_like(distance)),
             _amplitude(bins, residuals[rows], 1 - leverage[rows]),
+            member,
         )
+        if member.shape[1]:
+            part.stages = tuple(self._stages(part, i))
         scaled = residuals[rows] / part.amplitude
         if part.patterns.shape[1] and np.isfinite(scaled).all():
             # q and u of the residuals at each setting, (2 n_settings, n_wavelengths)
@@ -231,6 +259,17 @@ class Scatter:
             size = np.repeat(np.sum(errors**2, axis=1).reshape(-1, 2).sum(axis=1), 2)
             part.patterns = part.patterns * np.sqrt(0.5 + 0.5 * size / max(size.mean(), 1e-300))
         return part
+
+    def _stages(self, part, i):
+        """Yield how a wrong angle of each stage shows in the residuals of a dataset."""
+        dataset, measurement = self.measurement.datasets[i], self.measurement
+        sweep = dataset.forward(measurement.vector())
+        for stage in dataset.positions:
+            slope = dataset.along_stage(measurement.chains[i], sweep, stage)
+            slope = slope / (self._level[part.rows] * part.amplitude)
+            size = np.sqrt(np.mean(slope**2))
+            if size > 0 and np.isfinite(size):
+                yield part.dense(slope[:, None] / size)[..., 0]
 
     def _shares(self, part, residuals):
         """Solve for the shares with which products of residuals are as large as they are."""
@@ -284,11 +323,13 @@ class Scatter:
         """
         part = self.parts[i]
         found = np.full(len(part.kernels[0]), np.nan)
-        parts = zip(part.shares, part.told, part.components(), strict=True)
-        known = [(share, told, kernel) for share, told, (together, kernel) in parts if together]
-        if not any(told for _, told, _ in known):
+        known = [np.diag(kernel) if together else None for together, kernel in part.components()]
+        present = part.dense(np.ones((len(part.bin), 1)))[..., 0].sum(axis=0)
+        known += [np.sum(stage**2, axis=0) / np.maximum(present, 1) for stage in part.stages]
+        known = list(zip(part.shares, part.told, known, strict=True))
+        if not any(told for _, told, size in known if size is not None):
             return found
-        variance = sum(share * np.diag(kernel) for share, _, kernel in known)
+        variance = sum(share * size for share, _, size in known if size is not None)
         found[part.bin] = np.sqrt(variance)[part.bin] * part.amplitude * self._level[part.rows]
         return found
 
@@ -318,17 +359,19 @@ def _solved(seen, found, taken):
     return shares
 
 
-def _patterns(dataset, group):
-    """Return how an error of q and u at each setting shows in the pairs, (n_pairs, 2 n_groups)."""
+def _members(dataset, group):
+    """Return which pair is at which setting, (n_pairs, n_groups); none where groups are few."""
     count = int(group.max()) + 1
-    if count < _FEWEST_SETTINGS:
-        return np.zeros((len(dataset.frames), 0))
     of_pair = np.zeros(len(dataset.frames), dtype=int)
     of_pair[dataset.group_of_datum] = group
+    return of_pair[:, None] == np.arange(count if count >= _FEWEST_SETTINGS else 0)
+
+
+def _patterns(dataset, member):
+    """Return how an error of q and u at each setting shows in the pairs, (n_pairs, 2 n_groups)."""
     plate = dataset.positions.get("hwp")
-    angle = np.zeros(len(of_pair)) if plate is None else 4 * plate[0]
-    member = of_pair[:, None] == np.arange(count)
-    out = np.empty((len(of_pair), 2 * count))
+    angle = np.zeros(len(member)) if plate is None else 4 * plate[0]
+    out = np.empty((len(member), 2 * member.shape[1]))
     # q and u of each setting next to each other
     out[:, 0::2], out[:, 1::2] = member * np.cos(angle)[:, None], member * np.sin(angle)[:, None]
     return out

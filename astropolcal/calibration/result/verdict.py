@@ -130,11 +130,7 @@ def verdict(calibration, targets=TARGETS):
         tied = {name: entry for name, entry in known.items() if entry["tied"]}
         beyond = [n for n, e in tied.items() if are_outside(e["value"], *limits(e["bounds"])).any()]
         cautions += [f"tied beyond its bounds: {', '.join(beyond)}"] if beyond else []
-        if apart := _apart(calibration):
-            moves = listed([f"{one['change_deg']:+.2g}" for one in apart], "or")
-            which = f"{listed([one['parameter'] for one in apart], 'or')} differs"
-            which += f" in {apart[0]['dataset']} by {moves} deg"
-            cautions.append(f"{which} ({apart[0]['sigma']:.0f} sigma)")
+        cautions += what_differs(calibration)
         if disagrees_with_priors(calibration):
             told = calibration.fit.get("against_prior")
             which = f": {told['parameter']} by {told['sigma']:.0f} sigma" if told else ""
@@ -338,6 +334,15 @@ def _apart(calibration):
     # which angle it is, is told as surely as that there is a difference
     least = found[0]["sigma"] ** 2 - APART**2 if found else 0.0
     return [o for o in found if o["dataset"] == found[0]["dataset"] and o["sigma"] ** 2 > least]
+
+
+def what_differs(calibration):
+    """Say in which dataset an angle differs from that of the others, in a list; empty if none."""
+    if not (apart := _apart(calibration)):
+        return []
+    moves = listed([f"{one['change_deg']:+.2g}" for one in apart], "or")
+    which = f"{listed([one['parameter'] for one in apart], 'or')} differs"
+    return [f"{which} in {apart[0]['dataset']} by {moves} deg ({apart[0]['sigma']:.0f} sigma)"]
 
 
 def _few(calibration):

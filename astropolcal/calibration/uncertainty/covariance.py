@@ -24,7 +24,7 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.calibration.identifiability.linearized import LARGE, RANK, STILL
-from astropolcal.calibration.noise.scatter import Scatter
+from astropolcal.calibration.noise.scatter import Scatter, by_chance
 from astropolcal.calibration.noise.weighting import Problem, problem_of
 from astropolcal.exceptions import ParameterError
 from astropolcal.measurement.parameters import declared_step, step_of
@@ -511,10 +511,15 @@ def disagreements(measurement, whitened, weighting, scatter):
         if not size > _SEEN * (own @ own):
             continue
         variance = level**2 * size
-        if scatter is not None:
-            scattered = scatter.middle(left[:, None])[0, 0] + level**2 * (lost @ lost)
-            variance = max(variance, scattered)
-        change, std = own @ residuals / size, np.sqrt(variance) / size
+        change = own @ residuals / size
+        if scatter is not None and abs(change) * np.sqrt(size) > APART * level:
+            # a change is no scatter: it is that of the residuals without it
+            beside = Scatter(measurement, weighting, whitened, left / np.linalg.norm(left))
+            scattered = beside.middle(left[:, None])[0, 0] + level**2 * (lost @ lost)
+            settings = [part.patterns.shape[1] // 2 for part in beside.parts]
+            luck = by_chance(min(filter(None, settings), default=None))
+            variance = luck**2 * scattered
+        std = np.sqrt(variance) / size
         if abs(change) > APART * std and std < _TOLD:
             one = {"parameter": slot.name, "dataset": names[i], "change_deg": float(change)}
             found.append(one | {"std_deg": float(std), "sigma": float(abs(change) / std)})
