@@ -502,9 +502,8 @@ def check_instruments(calibration, observations):
 
 def _conclude(nominal, base, exchanged, selection, frames):
     improved = selection.model.modest()
-    total = nominal.fit.chi2 - (nominal.problem.n_data - nominal.problem.size)
-    # shares are of the excess over the noise; a gap below it must not give more than 1
-    total = max(total, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
+    # a gap below the noise must not give shares of more than 1
+    total = max(nominal.excess, nominal.fit.chi2 - improved.fit.chi2, 1e-300)
     causes = [_exchanged(nominal, base, improved, exchanged, total)] if exchanged else []
     errors = [None] * len(selection.groups) if None in selection.history else selection.history
     for i, group in enumerate(selection.groups):
@@ -525,8 +524,7 @@ def _exchanged(nominal, base, improved, exchanged, total):
     It is no surer than it explains the double differences alone: others may be in its place.
     """
     effect, *others = exchanged
-    excess = improved.fit.chi2 - (improved.problem.n_data - improved.problem.size)
-    sure = _SURE_SIGN * (1 - min(max(excess / total, effect.left, 0.0), 1.0))
+    sure = _SURE_SIGN * (1 - min(max(improved.excess / total, effect.left, 0.0), 1.0))
     aliases = [(Candidate(other, None, 0.0, 1, 0.0), 1 / len(exchanged)) for other in others]
     share = (nominal.fit.chi2 - base.fit.chi2) / total
     return Cause(effect, None, float(sure), aliases, 1 / len(exchanged), 0.0, float(share))

@@ -119,6 +119,11 @@ class Model:
         """Mean square of the whitened residuals: 1 where noise is all that is left."""
         return self.fit.chi2 / max(self.problem.n_data - self.problem.size, 1)
 
+    @property
+    def excess(self):
+        """Excess of chi-square over that of noise: what a gap and its shares are measured by."""
+        return self.fit.chi2 - self.linear.freedom
+
     @cached_property
     def p_value(self):
         """Probability of the residuals by noise alone."""
@@ -161,7 +166,7 @@ class Model:
     def could_hide(self):
         """Return the excess of chi-square that the residuals do not exclude (95 %)."""
         freedom, spread = self.linear.freedom, 2 * self.alike * _ONE_SIDED**2
-        excess = max(self.fit.chi2 - freedom, 0.0)
+        excess = max(self.excess, 0.0)
         # noncentral chi-square, which is nearly normal: (x - excess)^2 = spread (freedom + 2 x)
         return float(excess + spread + np.sqrt(spread * (2 * excess + spread + freedom)))
 

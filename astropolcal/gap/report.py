@@ -122,9 +122,8 @@ def _worked_out(diagnosis):
         cause["details"] = _words.details(cause, ranks)
         cause["words"] = _words.cause(cause)
     noisy = diagnosis.remainder_p_value > REMAINDER
-    old, new = (m.fit.chi2 - m.problem.n_data for m in (nominal, improved))
-    # the share of the excess over the noise that the improved model leaves
-    left = float(np.clip(new / old, 0, 1)) if old > 0 else 1.0
+    old = nominal.excess
+    left = float(np.clip(improved.excess / old, 0, 1)) if old > 0 else 1.0
     scores = ("statistic", "rank", "evidence")
     # as they were given: a part of a run has a name of its own, and is no run
     names = diagnosis.settings.get("names", [o.name for o in improved.observations])
@@ -200,7 +199,7 @@ def _where(diagnosis):
     alone, rest = _located(model)
     # what is at one wavelength is no perturbation with a law in wavelength
     is_there = alone and diagnosis.verdict == "unexplained"
-    excess = max(model.fit.chi2 - model.linear.freedom, 1e-300)
+    excess = max(model.excess, 1e-300)
     # what may be in place of all causes
     courses = [
         {

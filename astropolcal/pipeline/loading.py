@@ -478,7 +478,7 @@ class LoadedCalibration:
         # b: beams, f: frames, w: wavelengths, k: measured, s and t: true Stokes parameters, r: rank
         matrix = np.einsum("kbf,bfws->wks", sums, [m.value[..., 0, :] for m in beams])
         slopes = np.einsum("kbf,bfwsr->wksr", sums, [m.factor[..., 0, :, :] for m in beams])
-        unknown = [(m.is_open | m.is_blind)[..., 0, :] for m in beams]
+        unknown = [np.logical_or(*m.flags())[..., 0, :] for m in beams]
         unknown = np.einsum("kbf,bfws->wks", np.abs(sums), unknown) > 0
         inverse = np.linalg.inv(matrix[..., :3])
         flat = given.reshape(len(given), size, -1)

@@ -111,6 +111,7 @@ def test_change_is_found_where_it_is(years):
     assert len(table) == 2 * 5
     for row in table:
         changed = row["what"] in ("all", "derotator") and row["before"] == "run1"
+        # in run1 noise happens to be shared, which counts: without, it is more than 15
         assert (row["sigma"] > 5) == changed, row
         if not changed:
             assert row["sigma"] < 3.5
@@ -396,7 +397,8 @@ def test_a_mirror_that_no_new_frame_saw_is_not_known_as_it_was(years):
     how = {"chain": chains, "cross_validate": False}
     with_star = restart(old, [new, star], ["wollaston"], **how)
     assert with_star.verdict().usable
-    assert f"of what is held, as of {DATES[1]}" in with_star.verdict().cautions[-1]
+    cautions = with_star.verdict().cautions
+    assert any(f"of what is held, as of {DATES[1]}" in one for one in cautions)
     np.testing.assert_array_equal(
         with_star.chains[1]["m3"].diattenuation, old.chains[1]["m3"].diattenuation
     )

@@ -116,8 +116,9 @@ _FEWEST_SETTINGS = 3
 # stages that stop beside the table's angle at each of 4 to 14 settings, 7 were said to change
 # without it, all with 4 settings, and 4 are
 _BY_CHANCE = 8.0
-# shares below so many times their error under independence count as chance
-_CHANCE = 2.0
+# shares below so many times their error under independence count as chance: of 2, of several shares
+# one is, and takes the luck of few settings with it
+_CHANCE = 3.0
 # share of the scatter that is independent from datum to datum at the least
 _INDEPENDENT = 0.05
 # and principal components of the errors at settings below so many times what they have by chance
