@@ -350,8 +350,9 @@ class Observations:
             ``"hwp_move"`` and ``"derotator_move"``, how far it went, in radian, and ``"hwp_next"``
             and ``"derotator_next"``, how far it goes next, so also of any other stage, and
             ``"hwp_move2"``, how far it went in the last two moves; ``"hwp_reversed"`` and
-            ``"derotator_reversed"``, how far it is from where it would be if each cycle came in reverse order;
-            ``"flc_state"``, 0 or 1 for the states A and B of a modulator; ``"parallactic_rate"``,
+            ``"derotator_reversed"``, how far it is from where it would be if each cycle came in
+            reverse order; ``"flc_state"``, 0 or 1 for the states A and B of a modulator;
+            ``"parallactic_rate"``,
             ``"hwp_rate"`` and ``"derotator_rate"``, by how much that angle changes from one frame
             to the next, in radian, so also of any other stage; ``"brightness"``, by what share the
             frame is brighter than the mean of the table; ``"flux"``, the fluxes of the beams in the
