@@ -116,9 +116,9 @@ _FEWEST_SETTINGS = 3
 # stages that stop beside the table's angle at each of 4 to 14 settings, 7 were said to change
 # without it, all with 4 settings, and 4 are
 _BY_CHANCE = 8.0
-# shares below so many times their error under independence count as chance: of 2, of several shares
-# one is, and takes the luck of few settings with it
-_CHANCE = 3.0
+# shares below so many times their error under independence count as chance; those of stages, of
+# which some are asked beside the others, are more often, and bring the luck of few settings
+_CHANCE, _CHANCE_OF_STAGES = 2.0, 3.0
 # share of the scatter that is independent from datum to datum at the least
 _INDEPENDENT = 0.05
 # and principal components of the errors at settings below so many times what they have by chance
@@ -299,7 +299,9 @@ class Scatter:
         shares = _solved(seen, found, told)
         # a share that independent data have by chance, and that cannot be negative, would make all
         # errors too large; the variance of a product of residuals is twice its trace
-        chance = _CHANCE * np.sqrt(2 / np.maximum(np.diag(seen), 1.0)) * shares.sum()
+        chance = np.sqrt(2 / np.maximum(np.diag(seen), 1.0)) * shares.sum()
+        n_stages = len(part.stages)
+        chance *= np.repeat([_CHANCE, _CHANCE_OF_STAGES], [len(chance) - n_stages, n_stages])
         chance[0] = 0.0
         shares = _solved(seen, found, told & (shares >= chance))
         # some of it always is independent, and all of it where nothing is told
