@@ -204,9 +204,7 @@ def correct(
     how["weights"] = None if by_variance else weights
     frames, solution, unmeasured = _estimated(model, frames, brightness, how, mode)
     systematic = _systematic(model, solution, mode, open_directions, n_samples, seed)
-    unmeasured += [_OPEN] * (systematic is not None and systematic.is_open)
-    unmeasured += [_BIASED] * (by_variance and getattr(frames.source, "estimated", False))
-    unmeasured += _unequal(solution, given)
+    unmeasured += _of_errors(systematic, by_variance, frames.source) + _unequal(solution, given)
     unmeasured += _disagreement(solution, given, systematic) if mode == "stokes" else []
     for words in doubts + unmeasured + _mirrored(calibration) + _circular(solution, frames):
         warn(words)
@@ -226,9 +224,20 @@ def correct(
         **known,
     )
     # of images single pixels are noise
-    if found.ndim == 2 and (words := impossible(result.polarization())):
+    return result if found.ndim > 2 else _with_warning(result)
+
+
+def _with_warning(result):
+    """Return spectra, and warn of a polarization that no light has."""
+    if words := impossible(result.polarization()):
         warn(f"{words}: too little of I, as of a background that was subtracted twice, or angles")
     return result
+
+
+def _of_errors(systematic, by_variance, source):
+    """Say where errors are open, and what weights by variances that follow the fluxes do."""
+    is_open = systematic is not None and systematic.is_open
+    return [_OPEN] * is_open + [_BIASED] * (by_variance and getattr(source, "estimated", False))
 
 
 def _check(frames, mode, weights, *choices):

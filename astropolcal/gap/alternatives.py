@@ -169,8 +169,10 @@ def _in_part(chains, observations, misfit, effects, say):
         i, order, words, good = edge
         best = nominal_calibration(*_read(found[0][1], *parts))
         # in double differences a frame without a partner is not seen, and few of many are no misfit
-        sure = _nearer(best.chains[i : i + 2], observations[i], order, words)
-        again = tried(i, sure[0], words, sure[1]) if sure[1] != good else ([],)
+        new, sure = _nearer(best.chains[i : i + 2], observations[i], order, words)
+        # a part of another length, or of other frames; none, or all of them, are no part
+        moved = 0 < sure < len(order) and (sure != good or np.any(new != order))
+        again = tried(i, new, words, sure) if moved else ([],)
         found, parts, where = again if again[0] else (found, parts, where)
     return found, parts, where
 
