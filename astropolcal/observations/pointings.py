@@ -25,7 +25,7 @@ from astropolcal.exceptions import AstropolcalError, ObservationError, Parameter
 from astropolcal.files import one_line, understood
 from astropolcal.observations.reading import numeric_column
 from astropolcal.optics import COORDINATES
-from astropolcal.optics.positions import PLACES, finite_position, is_move
+from astropolcal.optics.positions import PLACES, counted, finite_position, is_move
 from astropolcal.units import angle_to_rad, mjd_of, plain_number, to_unit
 from astropolcal.words import check_choice, check_type
 
@@ -463,8 +463,7 @@ def _moved(angle, what):
         period = next(tiled, len(angle))
         other = rows - 2 * (rows % period) + period - 1
         return np.where(other < len(angle), angle[np.minimum(other, len(angle) - 1)] - angle, 0.0)
-    word = what.rstrip("0123456789")
-    count = int(what[len(word) :] or 1)
+    word, count = counted(what)
     if word == "next":
         return angle[np.minimum(rows + count, rows[-1:])] - angle
     steps = angle - angle[np.maximum(rows - count, 0)]

@@ -27,6 +27,12 @@ MOVES = ("_direction", "_move", "_next", "_rate", "_reversed")
 PLACES = {"time": u.day, "x": u.arcsec, "y": u.arcsec}
 
 
+def counted(name):
+    """Return the name of a move without its number, and that, as of ``"hwp_move2"``; 1 without."""
+    word = name.rstrip("0123456789")
+    return word, int(name[len(word) :] or 1)
+
+
 def is_move(name):
     """Return whether a position is a move of a stage, or several, as ``"hwp_move2"``."""
     return name.rstrip("0123456789").endswith(MOVES)

@@ -13,6 +13,7 @@ from astropolcal.gap.effects.where import Where, is_held
 from astropolcal.measurement import Tie
 from astropolcal.measurement.parameters import bind_prior
 from astropolcal.observations.pointings import TRACKING
+from astropolcal.optics.positions import counted
 from astropolcal.units import to_unit
 
 #: Lag of an angle in frames, written as an angle over that of one frame: 0.25, at most 2.
@@ -510,8 +511,7 @@ class Misread(Alternative):
 
     def edge(self, observations):
         """Return the frames, (F,) of bool, whose angle is in no row of their table."""
-        word = self.what.rstrip("0123456789")
-        count = int(self.what[len(word) :] or 1)
+        word, count = counted(self.what)
         if self.run not in (None, observations.name) or word not in ("_move", "_next"):
             return super().edge(observations)
         # exposures in their order: frames of several beams are taken at once
