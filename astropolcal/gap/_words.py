@@ -336,7 +336,7 @@ def sentences(content, several=False):
     noise = f"{noise}wide tails." if tails else ""
     rest = (
         part(content)
-        for part in (_what, _against_prior, _instead, _how_large, _what_is_left, _on_sky)
+        for part in (_what, _unusable, _against_prior, _instead, _how_large, _what_is_left, _on_sky)
     )
     return [words for words in (first, noise, *rest) if words]
 
@@ -402,6 +402,12 @@ def _what(content):
     where = content["where_left"] or content["where"]
     of = "what is left" if content["where_left"] else "the gap"
     return f"{text} {where_words(where[0], of)}." if where and not _courses(content) else text
+
+
+def _unusable(content):
+    """Return why `calibrate` with this model has no usable result."""
+    found = content["accuracy_after"]["unusable"]
+    return f"Its calibration is not usable as it is ({'; '.join(found)})." if found else ""
 
 
 def _against_prior(content):

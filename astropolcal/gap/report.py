@@ -23,7 +23,7 @@ from astropolcal.calibration import target_accuracies
 from astropolcal.calibration.fit.calibrate import fitted as fit_measurement
 from astropolcal.calibration.fit.calibrate import standing_at
 from astropolcal.calibration.identifiability.linearized import ranked
-from astropolcal.calibration.result.verdict import what_differs
+from astropolcal.calibration.result.verdict import faults, what_differs
 from astropolcal.calibration.uncertainty.covariance import covariance_along
 from astropolcal.chain import leaves
 from astropolcal.exceptions import AstropolcalError, AstropolcalWarning, GapError, ObservationError
@@ -509,6 +509,7 @@ def accuracies(fitted, cross_validate=True):
         "datasets": [],
         "targets": [],
         "against_prior": None,
+        "unusable": [],
     }
     try:
         with warnings.catch_warnings(action="ignore", category=AstropolcalWarning):
@@ -529,6 +530,8 @@ def accuracies(fitted, cross_validate=True):
     return found | {
         "rms_percent": rms,
         "against_prior": seen.fit["against_prior"],
+        # what calibrate would say, of which residuals as small as noise tell nothing
+        "unusable": faults(seen),
         "datasets": [
             {"name": one.name, "source": one.source}
             | {f"{key}_percent": _median(table[key].value) for key in ACCURACIES}

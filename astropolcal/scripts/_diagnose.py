@@ -89,9 +89,11 @@ def run(arguments):
     # first the files: a reader of our words may have gone in the meantime
     _write(diagnosis, content, arguments, instrument)
     following = [exposure(entry, content["causes"]) for entry in content["next_observations"][:1]]
+    unusable = content["accuracy_after"]["unusable"]
     keep = "--save FILE.asdf calibrates with what was found"
     keep = f"correct measurements with {arguments.save}" if arguments.save else keep
-    found = {"none": "calibrate with this model", "named": keep, "located": keep}
+    fine = "astropolcal calibrate, which says more" if unusable else "calibrate with this model"
+    found = {"none": fine, "named": keep, "located": keep}
     told = following or [found.get(content["verdict"], "more frames, at other angles")]
     told = [_CORRECT] if content["misread"] and content["causes"][0]["probability"] >= 0.5 else told
     saved = not content["misread"] and arguments.save

@@ -455,6 +455,21 @@ def test_what_takes_a_parameter_off_its_prior_may_be_what_the_model_lacks():
         assert (says in " ".join(told["sentences"])) == bool(sigma)
 
 
+def test_a_model_that_agrees_but_has_no_usable_calibration_is_not_praised_alone():
+    """The polarizer was left in: a mirror that polarizes like one describes the data to noise."""
+    charis, grid = instruments.get("charis"), [1.2, 1.45, 1.6, 1.9, 2.2] * u.um
+    chains = {
+        source: charis.chain(source, derotator="linear", wavelength=grid)
+        for source in ("polarized", "unpolarized")
+    }
+    for true, says in (("unpolarized", False), ("polarized", True)):
+        seen = simulate(chains[true], grid, frames(), seed=2, meta={"source": "unpolarized"})
+        told = to_dict(diagnose(chains["unpolarized"], seen, **ASKED))
+        assert told["verdict"] == "none"
+        assert ("as no mirror does" in " ".join(told["accuracy_after"]["unusable"])) == says
+        assert ("as no mirror does" in told["sentences"][1]) == says
+
+
 def test_an_improved_model_is_a_calibration_with_the_sizes_and_errors_of_the_report(found, nothing):
     report = Fitted(found.improved)
     seen, same = (with_causes(one, "charis") for one in (report, Fitted(nothing.improved)))

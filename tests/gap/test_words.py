@@ -63,7 +63,8 @@ def content(*causes, **changes):
     target = {"dolp_percent": 1.0, "s_p_percent": 0.05, "s_chi_deg": 0.25, "words": "so"}
     dataset = {"name": "lamp", "s_res_percent": 1.0, "s_cv_percent": None}
     own = {"observable": "normalized_double_difference"}
-    accuracy = own | {"datasets": [dataset], "targets": [target], "against_prior": None}
+    accuracy = own | {"datasets": [dataset], "targets": [target]}
+    accuracy |= {"against_prior": None, "unusable": []}
     one = {
         "verdict": "named",
         "frames": [],
