@@ -18,6 +18,7 @@ from astropolcal.calibration.fit.strategies import few_frames
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.calibration.noise.estimates import rms
 from astropolcal.calibration.noise.weighting import first_weighting
+from astropolcal.calibration.result.verdict import NO_SPLITTER
 from astropolcal.calibration.system import at_wavelengths
 from astropolcal.chain import join, leaves
 from astropolcal.exceptions import AstropolcalWarning, GapError, ObservationError
@@ -29,6 +30,7 @@ from astropolcal.measurement import Measurement
 from astropolcal.measurement.datasets import check_chains
 from astropolcal.observations.pointings import frame_names
 from astropolcal.observations.reading import bins_on_grid, common_wavelengths, nearest_bins
+from astropolcal.optics import WollastonPrism
 
 __all__ = []
 
@@ -374,6 +376,11 @@ def _best_alternative(chains, observations, made, found, say):
             say(f"calibrating: {effect.title}")
             asked, before = _read(effect, chains, observations), misfit
             tried = nominal_calibration(*asked)
+            # where the fit leaves no polarization, as of a lamp that has none, any sign does
+            optics = (leaf for chain in tried.chains for leaf in leaves(chain))
+            prisms = [leaf for leaf in optics if isinstance(leaf, WollastonPrism)]
+            if any(np.median(prism.efficiency) < NO_SPLITTER for prism in prisms):
+                continue
             if _misfit(tried) < (most if best is None else _misfit(best[0])):
                 best = tried, asked, misfit, effect
     if best is not None:

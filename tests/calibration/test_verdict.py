@@ -260,7 +260,23 @@ def test_a_mirror_that_polarizes_as_none_does(monkeypatch):
         known = {"m3.diattenuation": _entry(np.array(percent) / 100, fixed=fixed)}
         words = verdicts._mirrors(_calibration(source), known)
         told = f"m3 polarizes by more than 30 %, as no mirror does: is night really {source!r}?"
-        assert words == ([told] if says else []), (source, fixed, says)
+        assert [*words] == ([told] if says else []), (source, fixed, says)
+
+
+def test_a_lamp_without_its_polarizer_is_no_prism_without_efficiency():
+    grid = [1.2, 1.45, 1.6, 1.9, 2.2] * u.um
+    chains = {
+        source: CHARIS.chain(source, derotator="linear", wavelength=grid)
+        for source in ("polarized", "unpolarized")
+    }
+    frames = half_wave_plate_cycles(derotator=[45, 60, 75, 90, 110, 130] * u.deg)
+    asks = "wollaston.efficiency is below 50 %, as of no prism: is lamp really 'polarized'?"
+    for true, says in (("polarized", False), ("unpolarized", True)):
+        for seed in range(3):
+            told = {"meta": {"source": "polarized"}, "name": "lamp", "seed": seed}
+            seen = simulate(chains[true], grid, frames, **told)
+            reasons = calibrate(chains["polarized"], seen).verdict().reasons
+            assert (reasons[:1] == [asks]) == says, reasons
 
 
 def test_residuals_of_a_model_that_is_none():

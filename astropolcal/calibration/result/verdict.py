@@ -15,7 +15,7 @@ from astropolcal.calibration.validation.stars import fitted_stars
 from astropolcal.calibration.validation.targets import TARGETS, target_accuracies
 from astropolcal.chain import leaves, stages
 from astropolcal.measurement.parameters import are_outside, limits
-from astropolcal.optics import COORDINATES
+from astropolcal.optics import COORDINATES, WollastonPrism
 from astropolcal.units import median_of_known
 from astropolcal.words import HEIGHT, WIDTH, counted, listed, p_words, shortened
 
@@ -27,6 +27,8 @@ _KINDS = ("polarized", "unpolarized", "star")
 _MOST = 0.5
 # bare metals polarize by a few percent at most, coated ones by little more
 _NO_MIRROR = 30 * u.percent
+#: Beam splitters separate polarization with an efficiency of 0.9 or more.
+NO_SPLITTER = 0.5
 # residuals at least as large happen by chance less often
 _UNLIKELY = 0.01
 # the mounts are known better than this before any fit, and it turns 6 % of Q into U
@@ -162,8 +164,8 @@ def _reasons(calibration, known, free, on_sky=((), ())):
     """
     # what must be wrong with the set-up or its description comes before what is not known
     wrong = [_nothing(calibration), _angles(calibration, free)]
-    wrong += [*_mirrors(calibration, known), _misfit(calibration), _carried_off(calibration)]
-    wrong.append(_drawn(calibration))
+    wrong += [*_mirrors(calibration, known), *_splitters(calibration, known)]
+    wrong += [_misfit(calibration), _carried_off(calibration), _drawn(calibration)]
     # the constants of laws are where inputs are zero, far from all frames
     trains = map(leaves, calibration.chains)
     laws = {f"{leaf.name}.{key}" for train in trains for leaf in train for key in leaf._follows}
@@ -282,11 +284,17 @@ def _excess(calibration):
     return min(times) if times and len(times) == len(tests) else 0.0
 
 
+def _really(calibration, is_polarized):
+    """Return the datasets with a polarized source, or the others, and their sources in words."""
+    both = ((r, kind_of_source(r.source) == "polarized") for r in calibration.datasets)
+    found = ((r.name, str(r.source)) for r, own in both if own == is_polarized)
+    return " or ".join(f"{name} really {source!r}" for name, source in found)
+
+
 def _mirrors(calibration, known):
     """Say of each mirror that polarizes as no mirror does, where the source is not to."""
-    sources = [r for r in calibration.datasets if kind_of_source(r.source) != "polarized"]
-    told, found = " or ".join(f"{r.name} really {str(r.source)!r}" for r in sources), []
-    for name in mirror_names(calibration) if sources else ():
+    told = _really(calibration, is_polarized=False)
+    for name in mirror_names(calibration) if told else ():
         if known.get(f"{name}.diattenuation", {"fixed": False})["fixed"]:
             continue
         table = mirror_values(calibration, name)
@@ -295,11 +303,24 @@ def _mirrors(calibration, known):
         least = np.abs(table["diattenuation"].value) - 3 * error
         # with certainty, at most wavelengths
         if np.mean(least * table["diattenuation"].unit > _NO_MIRROR) > _MOST:
-            found.append(
+            yield (
                 f"{name} polarizes by more than {_NO_MIRROR.value:g} %, as no mirror does: is "
                 f"{told}?"
             )
-    return found
+
+
+def _splitters(calibration, known):
+    """Say of each beam splitter that it hardly is one, where the source is polarized."""
+    told = _really(calibration, is_polarized=True)
+    optics = (leaf for chain in calibration.chains for leaf in leaves(chain))
+    names = dict.fromkeys(leaf.name for leaf in optics if isinstance(leaf, WollastonPrism))
+    for entry in (known.get(name := f"{own}.efficiency") for own in names if told):
+        if entry is None or entry["fixed"]:
+            continue
+        error = np.where(entry["at_bound"], 0.0, np.nan_to_num(entry["std"], nan=np.inf))
+        most = entry["value"] + 3 * error
+        if np.mean(most < NO_SPLITTER) > _MOST:
+            yield f"{name} is below {100 * NO_SPLITTER:.0f} %, as of no prism: is {told}?"
 
 
 def _of_one_table(calibration):
