@@ -407,7 +407,9 @@ def _what(content):
 def _unusable(content):
     """Return why `calibrate` with this model has no usable result."""
     found = content["accuracy_after"]["unusable"]
-    return f"Its calibration is not usable as it is ({'; '.join(found)})." if found else ""
+    # the most telling first
+    more = f", and {len(found) - 1} more" * (len(found) > 1)
+    return f"Its calibration is not usable as it is ({found[0]}{more})." if found else ""
 
 
 def _against_prior(content):
