@@ -160,7 +160,7 @@ def test_pairs_by_the_plate_on_request():
         [1, 2],
     ]
     with pytest.raises(ObservationError, match="pairing of the meta = 'time'; allowed are hwp"):
-        read(differences()).paired_by("time")
+        read(differences(META | {"pairing": "time"})).pairs()
 
 
 def test_state_of_every_frame():

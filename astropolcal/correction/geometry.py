@@ -9,17 +9,14 @@ of the sky already.
 """
 
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from astropolcal.exceptions import ParameterError
 from astropolcal.units import angle_to_rad
 
 __all__ = []
 
-_QUARTER = np.pi / 2
 # also the share of a pixel without a value from which on the result has none
 _EXACT = 1e-12
 # pixels after which the influence of a spline's neighbours has fallen below rounding
@@ -134,10 +131,6 @@ def _interpolated(planes, matrix, offset, shape, order):
     """Return what a spline through finite planes gives at the places of the result."""
     from scipy.ndimage import affine_transform
 
-    many = planes.shape[0] >= _FEWEST_PLANES and min(planes.shape[1:]) >= _SHORTEST
-    if many and order in (1, 3):
-        return resample(planes, matrix, offset, shape, order)
-    # mirrored edges are what the filter of our own spline assumes too
     settings = {"output_shape": shape, "mode": "mirror", "order": order}
     return np.stack([affine_transform(plane, matrix, offset, **settings) for plane in planes])
 
@@ -213,83 +206,3 @@ def azimuthal_variances(variance_q, variance_u, covariance, centre=None):
             cosine**2 * variance_q + sine**2 * variance_u + cross,
             sine**2 * variance_q + cosine**2 * variance_u - cross,
         )
-
-
-# ---- splines of many slices ----------------------------------------------------------------------
-# The same as `scipy.ndimage.affine_transform` with ``mode="mirror"`` makes of each slice. All
-# slices of a cube turn by the same angle, so the weights of the pixels are worked out once, and
-# applied to all of them as a sparse matrix.
-
-# below, the weights cost more than they save, or the ends of the recursion meet
-_FEWEST_PLANES, _SHORTEST = 5, 30
-# the pole of the cubic spline filter and the terms after which its powers are below 1e-14
-# (Unser, Aldroubi and Eden 1993, IEEE Trans. Signal Process. 41, 821)
-_POLE = np.sqrt(3.0) - 2.0
-_RECURSION = 25
-# pixels of the result whose weights are in memory at a time: 16 each, 12 bytes a weight
-_BLOCK = 2**17
-
-
-def resample(planes, matrix, offset, shape, order):
-    """Return finite images at ``matrix @ pixel + offset``, (planes, *shape)."""
-    count, height, width = planes.shape
-    # the slices are the last axis: the filter and the matrix then run over contiguous numbers
-    values = np.ascontiguousarray(planes.transpose(1, 2, 0), dtype=float)
-    if order == 3:
-        _filter(values.reshape(height, -1))
-    # now (column, row, slice), so that the pixel of a weight is row + height * column
-    values = np.ascontiguousarray(values.swapaxes(0, 1))
-    if order == 3:
-        _filter(values.reshape(width, -1))
-    values = values.reshape(-1, count)
-    out = np.empty((count, *shape))
-    rows = max(_BLOCK // shape[1], 1)
-    for first in range(0, shape[0], rows):
-        block = (first, min(first + rows, shape[0]), shape[1])
-        weights = _weights(block, tuple(map(tuple, matrix)), tuple(offset), (height, width), order)
-        out[:, first : block[1]] = (weights @ values).T.reshape(count, -1, shape[1])
-    return out
-
-
-def _filter(lines):
-    """Replace values by the coefficients of a cubic spline, along the first axis, in place."""
-    # the gain of the two passes, (1 - z)(1 - 1/z) = 6 for z = sqrt(3) - 2
-    lines *= 6.0
-    powers = _POLE ** np.arange(_RECURSION)
-    # start of the causal pass as if the signal went on mirrored at its first sample
-    lines[0] = powers @ lines[:_RECURSION]
-    for before, line in pairwise(lines):
-        line += _POLE * before
-    # start of the anticausal pass, mirrored at the last sample
-    lines[-1] = _POLE / (_POLE**2 - 1) * (lines[-1] + _POLE * lines[-2])
-    for line, behind in zip(lines[-2::-1], lines[:0:-1], strict=True):
-        np.subtract(behind, line, out=line)
-        line *= _POLE
-
-
-# both beams, fluxes and then variances, are turned alike
-@lru_cache(maxsize=2)
-def _weights(block, matrix, offset, size, order):
-    """Return the weight of each pixel, column by column of the image, in those of the result."""
-    i, j = np.arange(*block[:2])[:, None], np.arange(block[2])
-    lines = zip(matrix, offset, strict=True)
-    places = ((by_row * i + by_column * j + o).ravel() for (by_row, by_column), o in lines)
-    (y, by_y), (x, by_x) = (_taps(p, n, order) for p, n in zip(places, size, strict=True))
-    index = (y[:, :, None] + size[0] * x[:, None, :]).reshape(len(y), -1)
-    weights = (by_y[:, :, None] * by_x[:, None, :]).reshape(index.shape)
-    # every row of the matrix has the same number of weights, 4 or 16
-    ends = np.arange(0, weights.size + 1, weights.shape[1], dtype=np.int32)
-    return csr_array((weights.ravel(), index.ravel(), ends), shape=(len(index), size[0] * size[1]))
-
-
-def _taps(place, n, order):
-    """Return the pixels that have a share at each place along an axis of n pixels, and shares."""
-    from scipy.interpolate import BSpline
-
-    # what lies outside has no value in the end; it must only not lie outside of the array
-    place, knots = np.clip(place, 0.0, n - 1.0), np.arange(-order, n + order, dtype=float)
-    basis = BSpline.design_matrix(place, knots, order)
-    pixels = basis.indices.reshape(-1, order + 1) - order // 2
-    # taps beyond an end fall on the pixels mirrored about it
-    pixels = n - 1 - np.abs(n - 1 - np.abs(pixels))
-    return pixels, basis.data.reshape(pixels.shape)

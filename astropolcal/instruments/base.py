@@ -768,7 +768,7 @@ class Polarimeter(Instrument):
         return shared.telescope(aluminium(self.grid(wavelength)), self.altitude)
 
 
-class SubaruPolarimeter(Polarimeter):
+class SubaruPolarimeter(Instrument):
     """
     What stands downstream of Subaru's tertiary mirror, half-wave plate and derotator.
 
@@ -789,14 +789,61 @@ class SubaruPolarimeter(Polarimeter):
     times = {"mjd": "MJD", "time": "UT"}
     sky_law = SkyLaw()
 
-    def light(self, source, grid, star, target):
-        """Return the internal source, or a star and the telescope."""
-        return shared.entrance(source, grid, star, target, "free")
+    def chain(
+        self,
+        source="polarized",
+        optics_in=(),
+        *,
+        wavelength=None,
+        derotator="elliptical",
+        bounds="physical",
+        m3="free",
+        star="star",
+        target=None,
+    ):
+        """
+        Return the chain of an internal source or a star, ready to be calibrated.
 
-    def inner(self, source, optics_in, grid):
-        """Return the half-wave plate, the derotator and the camera."""
-        plate = shared.two_layer_plate(**shared.misaligned(0))
-        return [plate, shared.published_derotator(grid), *self.camera(optics_in, grid)]
+        Parameters
+        ----------
+        source : str
+            ``"polarized"`` or ``"unpolarized"``: internal source with or without its
+            polarizer; without it the fold mirror's diattenuation is a free parameter for each
+            wavelength. ``"unpolarized standard star"``: a star of zero polarization, downstream of
+            the telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's
+            q and u are free parameters for each wavelength, in the frame of the sky.
+        optics_in : sequence of str
+            Optional optics in the beam.
+        wavelength : `~astropy.units.Quantity`, optional
+            Grid, by default that of the instrument.
+        derotator : {"elliptical", "linear", "kmirror"}
+            Elliptical as in the paper, linear as in the calibrations before, or three silver
+            mirrors with films of silica: their thickness and factors on n and k of silver are
+            free, the factors with normal priors of 0.5 and 0.1 around 1.
+        bounds : {"physical", "paper"}
+            Retardances within 360 deg of zero, or within the paper's bounds (0 to 360 deg in the
+            published signs). Either way thicknesses are within 0.6 to 1.4 of 't Hart's,
+            misalignments within 5 deg, efficiencies between 0 and 1.
+        m3 : {"free", "power law", "metal"}
+            Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
+            permittivity, or silver with a film.
+
+        Others, and what is returned and raised, are as in `Instrument.chain`.
+
+        Examples
+        --------
+        >>> from astropolcal import instruments
+        >>> chain = instruments.get("charis").chain(derotator="linear")
+        >>> chain["derotator"].retardance.shape
+        (22,)
+        """
+        known = {"derotator": (derotator, shared.DEROTATORS), "bounds": (bounds, shared.BOUNDS)}
+        self.check_choices(source, optics_in, m3=(m3, shared.M3_MODELS), **known)
+        grid = self.grid(wavelength)
+        train = shared.entrance(source, grid, star, target, m3)
+        train.append(shared.two_layer_plate(**shared.misaligned(0)))
+        train.append(shared.published_derotator(grid, derotator, bounds))
+        return join([*train, *self.camera(optics_in, grid)])
 
     def camera(self, optics_in, grid):
         """Return the optics downstream of the derotator, here a Wollaston prism."""

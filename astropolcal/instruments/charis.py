@@ -12,10 +12,8 @@ solution, with the same double differences.
 """
 
 import astropy.units as u
-import numpy as np
 
 from astropolcal import optics
-from astropolcal.chain import join
 from astropolcal.exceptions import InstrumentError
 from astropolcal.instruments import telescope as subaru
 from astropolcal.instruments.base import SubaruPolarimeter
@@ -43,6 +41,11 @@ _ABSENT = {
 class CHARIS(SubaruPolarimeter):
     """
     Subaru/SCExAO/CHARIS in its broadband spectropolarimetric mode.
+
+    Free are the paper's parameters: two thicknesses and the misalignments of polarizer, half-wave
+    plate and derotator for all wavelengths, and the derotator's retardances and the Wollaston's
+    efficiency for each. Optional optics are ``"nbs"`` (beam switcher, parity flip) and
+    ``"dichroic"`` (YJH50, as a retarder of zero retardance that is fixed until you free it).
 
     Examples
     --------
@@ -94,72 +97,15 @@ class CHARIS(SubaruPolarimeter):
     )
     optional_optics = ("nbs", "dichroic")
 
-    def chain(
-        self,
-        source="polarized",
-        optics_in=(),
-        *,
-        wavelength=None,
-        derotator="elliptical",
-        bounds="physical",
-        m3="free",
-        star="star",
-        target=None,
-    ):
-        """
-        Return the chain of an internal source or a star, ready to be calibrated.
-
-        Free are the paper's parameters: two thicknesses and the misalignments
-        of polarizer, half-wave plate and derotator for all wavelengths, and
-        the derotator's retardances and the Wollaston's efficiency for each.
-
-        Parameters
-        ----------
-        source : str
-            ``"polarized"`` or ``"unpolarized"``: internal source with or without its
-            polarizer; without it the fold mirror's diattenuation is a free parameter for each
-            wavelength. ``"unpolarized standard star"``: a star of zero polarization, downstream of
-            the telescope's tertiary mirror. ``"polarized standard star"`` or ``"star"``: the star's
-            q and u are free parameters for each wavelength, in the frame of the sky.
-        optics_in : sequence of str
-            Optional optics in the beam: ``"nbs"`` (beam switcher, parity flip) and ``"dichroic"``
-            (YJH50, as a retarder of zero retardance that is fixed until you free it).
-        wavelength : `~astropy.units.Quantity`, optional
-            Grid, by default the 22 broadband bins.
-        derotator : {"elliptical", "linear", "kmirror"}
-            Elliptical as in the paper, linear as in the calibrations before, or three silver
-            mirrors with films of silica: their thickness and factors on n and k of silver are
-            free, the factors with normal priors of 0.5 and 0.1 around 1.
-        bounds : {"physical", "paper"}
-            Retardances within 360 deg of zero, or within the paper's bounds (0 to 360 deg in the
-            published signs). Either way thicknesses are within 0.6 to 1.4 of 't Hart's,
-            misalignments within 5 deg, efficiencies between 0 and 1.
-        m3 : {"free", "power law", "metal"}
-            Tertiary mirror of a star's chain: a diattenuation per wavelength, the paper's
-            permittivity, or silver with a film.
-
-        Others, and what is returned and raised, are as in `Instrument.chain`.
-
-        Examples
-        --------
-        >>> from astropolcal import instruments
-        >>> chain = instruments.get("charis").chain(derotator="linear")
-        >>> chain["derotator"].retardance.shape
-        (22,)
-        """
-        known = {"derotator": (derotator, subaru.DEROTATORS), "bounds": (bounds, subaru.BOUNDS)}
-        self.check_choices(source, optics_in, m3=(m3, subaru.M3_MODELS), **known)
-        grid = self.grid(wavelength)
-        train = subaru.entrance(source, grid, star, target, m3)
-        train.append(subaru.two_layer_plate(**subaru.misaligned(0)))
-        train.append(subaru.published_derotator(grid, derotator, bounds))
+    def camera(self, optics_in, grid):
+        """Return the optional optics that are in the beam, and the Wollaston prism."""
+        train = []
         if "dichroic" in optics_in:
             # to be freed where several angles of the derotator tell the two apart
             train.append(optics.LinearRetarder(name="dichroic", fixed={"retardance": True}))
         if "nbs" in optics_in:
             train.append(optics.ParityFlip(name="nbs"))
-        train.append(optics.WollastonPrism(efficiency=np.full(grid.size, 0.985), name="wollaston"))
-        return join(train)
+        return [*train, *super().camera(optics_in, grid)]
 
     def published(self):
         """

@@ -205,27 +205,19 @@ class _NormalizedDifference(Observable):
     signs = ()
 
     def _parts(self, right, left):
-        each, both = right - left, right + left
-        # few frames, the first with sign 1: plain sums are quicker than sums along an axis
-        difference, total = each[0], both[0]
-        for sign, one, sum_ in zip(self.signs[1:], each[1:], both[1:], strict=True):
-            difference = difference + one if sign > 0 else difference - one
-            total = total + sum_
-        return difference, total
+        signs = np.reshape(self.signs, (-1, 1, 1))
+        return signs, (signs * (right - left)).sum(axis=0), (right + left).sum(axis=0)
 
     def evaluate(self, right, left):
         """Return x, shape (W, P); see `Observable.evaluate`."""
-        difference, total = self._parts(right, left)
+        _, difference, total = self._parts(right, left)
         return difference / total
 
     def derivative(self, right, left):
         """Return dx/dR and dx/dL; see `Observable.derivative`."""
-        difference, total = self._parts(right, left)
-        inverse = 1.0 / total
-        x_inverse = difference * (inverse * inverse)
-        up, down = inverse - x_inverse, -inverse - x_inverse
-        d_right = [up if sign > 0 else down for sign in self.signs]
-        return np.stack(d_right), np.stack([down if one is up else up for one in d_right])
+        signs, difference, total = self._parts(right, left)
+        x = difference / total
+        return (signs - x) / total, (-signs - x) / total
 
 
 class NormalizedDoubleDifference(_NormalizedDifference):

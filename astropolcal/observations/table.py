@@ -408,36 +408,6 @@ class Observations:
         check_choice(f"{self._label}: pairing of the meta", value, PAIRINGS, ObservationError)
         return value
 
-    def paired_by(self, pairing):
-        """
-        Return the same observations with other pairs.
-
-        Parameters
-        ----------
-        pairing : {"hwp", "flc_state"}
-            What differs between the frames of a pair, see `pairing`.
-
-        Returns
-        -------
-        Observations
-
-        Raises
-        ------
-        ObservationError
-            If it is something else.
-
-        Examples
-        --------
-        >>> from astropolcal.observations import Observations, example_table
-        >>> table = example_table(hwp=(0, 0, 45, 45), wavelength=(0.625,))
-        >>> table["flc_state"] = ["A", "B", "A", "B"]
-        >>> Observations.from_table(table).paired_by("flc_state").pairs().tolist()
-        [[0, 1], [2, 3]]
-        """
-        new = Observations(self._grid, self.meta | {"pairing": pairing}, self.name, self.path)
-        _ = new.pairing  # refuses what is not allowed
-        return new
-
     def pairs(self, tolerance=0.3 * u.deg, *, derotator_tolerance=0.5 * u.deg, share=False):
         """
         Pair the frames 45 degrees of (commanded) half-wave-plate angle apart, or see `pairing`.

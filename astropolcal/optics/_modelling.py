@@ -1,16 +1,15 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """
-How our models differ from those of astropy: keywords, settings, units, chains, cheap copies.
+How our models differ from those of astropy: keywords, settings, units, chains.
 
-Nothing else in the package touches what `astropy.modeling` keeps private. Copies do (the
-dictionaries of models and parameters), because a calibration copies chains and measurements
-thousands of times, and a deep copy of everything takes five times as long. Chains do, because a
-fitter asks every model of a compound for its units, and astropy's ``Mapping`` has no answer.
-Bounds and ties do, because astropy drops their units.
+Nothing else in the package touches what `astropy.modeling` keeps private. Copies of measurements do
+(the dictionaries of models), because every fitter makes one. Chains do, because a fitter asks every
+model of a compound for its units, and astropy's ``Mapping`` has no answer. Bounds and ties do,
+because astropy drops their units.
 """
 
 from collections import defaultdict
-from copy import copy, deepcopy
+from copy import copy
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -24,8 +23,6 @@ from astropolcal.words import did_you_mean
 
 # by how much two wavelengths may differ and be the same, as in tables of observations
 _SAME = 1e-5
-# what a copy of an optic may share with it
-_SHARED = {str, bool, int, float, np.float64, type(None), slice}
 
 
 class Setting:
@@ -264,42 +261,6 @@ class ScalarParameters(OwnUnits, FittableModel):
     def _parameter_units_for_data_units(self, input_units, output_units):
         units = {name: self.__dict__[name].unit for name in self._param_names}
         return {name: unit for name, unit in units.items() if unit is not None}
-
-
-def deep_copied(optic, memo):
-    """
-    Return a copy of an optic and of all that it holds.
-
-    Chains are copied often; this is five times faster than copying every attribute.
-    """
-    new = optic.__class__.__new__(optic.__class__)
-    memo[id(optic)] = new
-    for key, value in optic.__dict__.items():
-        if not isinstance(value, Parameter):
-            new.__dict__[key] = _copied(value, memo)
-            continue
-        own = new.__dict__[key] = memo[id(value)] = value.__class__.__new__(value.__class__)
-        for name, one in value.__dict__.items():
-            # a frozen distribution of scipy does not change, and its copy takes longer than all
-            kept = name == "_prior" and hasattr(one, "dist")
-            own.__dict__[name] = new if name == "_model" else one if kept else _copied(one, memo)
-    return new
-
-
-def _copied(value, memo):
-    """Return a deep copy, without a detour for what most optics hold."""
-    kind = type(value)
-    if kind in _SHARED or isinstance(value, u.UnitBase):
-        return value
-    if kind is np.ndarray and value.dtype == float:
-        return value.copy()
-    if kind is dict or kind is defaultdict:
-        new = copy(value)
-        new.update((key, _copied(one, memo)) for key, one in value.items())
-        return new
-    if kind is tuple:
-        return tuple(_copied(one, memo) for one in value)
-    return deepcopy(value, memo)
 
 
 def with_own_scalars(model, labels):

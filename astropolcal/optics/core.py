@@ -25,7 +25,6 @@ from astropolcal.optics._modelling import (
     OwnUnits,
     Setting,
     add_parameters,
-    deep_copied,
     refuse_misspelt,
     values_text,
     with_values,
@@ -240,8 +239,6 @@ class Optic(FittableModel, metaclass=KeywordOnly):
         else:
             refuse_misspelt(self, attr, self.param_names)
         super().__setattr__(attr, value)
-
-    __deepcopy__ = deep_copied
 
     def __repr__(self):
         settings, known = self._settings(), inspect.signature(type(self)).parameters

@@ -10,7 +10,6 @@ import astropy.units as u
 import numpy as np
 
 from astropolcal.exceptions import ChainError, ParameterError
-from astropolcal.mueller import crossed, phase_of, turned, turned_back
 from astropolcal.optics._modelling import ScalarParameters
 from astropolcal.optics.positions import COORDINATES, finite_position
 from astropolcal.units import canonical_factor, length_to_um, to_unit
@@ -294,25 +293,17 @@ class LightCurve(Curve):
 
     def _beam(self, arm, place, values):
         wavelength, places = place
-        # light is in the frame of the optic that it enters, which stands at the angle ``frame``
-        steps, light, frame = [], np.eye(4)[self._element[1]], 0.0
+        steps, light = [], np.eye(4)[self._element[1]]
         values = self._values_at(wavelength, values)
         for optic, (dispersion, shift), (theta, *own) in zip(arm, places, values, strict=True):
-            dispersion, angle = optic._moved(dispersion, theta, shift)
-            if optic.rotates_frame:
-                frame = frame - angle
-                steps.append((optic, None, None, light, ()))
-                continue
-            phase, matrix, frame = phase_of(angle - frame), optic._matrix(dispersion, *own), angle
-            light = turned(light, phase)
-            steps.append((optic, phase, matrix, light, (dispersion, *own)))
-            light = _act(matrix, light)
-        # it changes neither I nor V
-        phase = phase_of(-frame) if self._element[0] in (1, 2) else None
-        return turned(light, phase), phase, steps
+            known = *optic._moved(dispersion, theta, shift), own
+            matrix = optic._oriented(*known)
+            steps.append((optic, matrix, light, known))
+            light = (matrix @ light[..., None])[..., 0]
+        return light, steps
 
     def _values(self, beams, size):
-        found = [self._flux(light, size) for light, *_ in beams]
+        found = [self._flux(light, size) for light, _ in beams]
         return found[0] if self._observable is None else self._observable.evaluate(*found)[0]
 
     def _flux(self, light, size):
@@ -322,10 +313,10 @@ class LightCurve(Curve):
 
     def _slopes(self, beams, size):
         if self._observable is None:
-            return self._slopes_of_beam(*beams[0])
-        found = [self._flux(light, size) for light, *_ in beams]
+            return self._slopes_of_beam(beams[0][1])
+        found = [self._flux(light, size) for light, _ in beams]
         weights = [weight[:, 0] for weight in self._observable.derivative(*found)]
-        parts = [self._slopes_of_beam(*beam) for beam in beams]
+        parts = [self._slopes_of_beam(steps) for _, steps in beams]
         return [
             [
                 sum(np.sum(w * slope, axis=0) for w, slope in zip(weights, slopes, strict=True))
@@ -334,24 +325,12 @@ class LightCurve(Curve):
             for own in zip(*parts, strict=True)
         ]
 
-    def _slopes_of_beam(self, light, phase, steps):
+    def _slopes_of_beam(self, steps):
         """Return the derivatives of the flux of a beam, (k, n)."""
-        row = np.eye(4)[self._element[0]]
-        # what a turn of all that is downstream does
-        turn, found = 2 * crossed(row, light), []
-        for optic, entrance, matrix, light, known in reversed(steps):
-            if matrix is None:
-                found.append([turn])
-                continue
-            row, behind = turned_back(row, phase), turn
-            changes = [_act(slope, light) for slope in optic._derivatives(*known)]
-            own = [np.einsum("...i,...i", row, change) for change in changes]
-            row, phase = _act(matrix.swapaxes(-1, -2), row), entrance
-            turn = 2 * crossed(row, light)
-            found.append([turn - behind, *own])
+        # what the optics downstream make of the light, (..., 1, 4)
+        row, found = np.eye(4)[self._element[0], None], []
+        for optic, matrix, light, known in reversed(steps):
+            slopes = optic._oriented_derivatives(matrix, *known)
+            found.append([(row @ slope @ light[..., None])[..., 0, 0] for slope in slopes])
+            row = row @ matrix
         return found[::-1]
-
-
-def _act(matrix, light):
-    # of one matrix for all light a quarter of the time
-    return light @ matrix.T if matrix.ndim == 2 else (matrix @ light[..., None])[..., 0]

@@ -380,17 +380,13 @@ class EllipticalRetarder(Optic):
         outer = vector[..., :, None] * vector[..., None, :]
         cross = (vector @ _CROSS).reshape(*total.shape, 3, 3)
         common = sinc_slope * cross + versine_slope * outer - sinc * np.eye(3)
-        return tuple(self._slope(i, vector, sinc, versine, common) for i in range(3))
-
-    @staticmethod
-    def _slope(i, vector, sinc, versine, common):
-        """Derivative to component i; ``common`` is that through the length, over d_i."""
-        out = mueller.blank(vector[..., 0])
-        block = out[..., 1:, 1:]
-        block += vector[..., i, None, None] * common + sinc * _CROSS[i].reshape(3, 3)
-        block[..., i, :] += versine[..., 0] * vector
-        block[..., :, i] += versine[..., 0] * vector
-        return out
+        slopes = np.zeros((3, *total.shape, 4, 4))
+        for i, block in enumerate(slopes[..., 1:, 1:]):
+            # through the length of d, then through its component
+            block += vector[..., i, None, None] * common + sinc * _CROSS[i].reshape(3, 3)
+            block[..., i, :] += versine[..., 0] * vector
+            block[..., :, i] += versine[..., 0] * vector
+        return tuple(slopes)
 
 
 # d @ _CROSS is the antisymmetric part of the rotation of (Q, U, V), row by row

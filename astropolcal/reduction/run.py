@@ -265,7 +265,7 @@ def reduce_run(
         ``max_radius`` (45 pixels); "growth": where the curve of growth of the mean image reaches
         99 %; or pixels), ``annulus`` (width of the ring of the background, 5 pixels),
         ``aperture_correction`` (whether fluxes are scaled to all of the star's light, by a
-        profile of its wings; or "growth", to what circles of ``max_radius`` have), ``companion``
+        profile of its wings), ``companion``
         (a second star brighter than this fraction of the first, 0.1, corrupts a frame) and
         ``max_masked`` (0.1, of the aperture as well as of the light in it).
 

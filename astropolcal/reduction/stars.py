@@ -80,7 +80,7 @@ def measure_stars(
     # what the noise of the background adds to the variance of a flux
     level_variance = np.zeros_like(result.flux)
     for k in np.flatnonzero(~result.failed):
-        found = _measured(run, result, k, result.radius[0, k])
+        found = _measured(run, result, k)
         if isinstance(found, str):
             result.flag(np.arange(len(cube)) == k, found)
         else:
@@ -92,9 +92,7 @@ def measure_stars(
         distance = np.hypot(*(np.diff(a[:, usable], axis=0)[0] for a in (result.x, result.y)))
         pixel = detector.variance(result.background[:, usable].mean(axis=0))
         result.covariance[usable] = shared_pixels(distance, result.radius[0, usable], pixel)
-    if aperture_correction == "growth":
-        _correct(result, *_growth_shares(result, run, max_radius))
-    elif aperture_correction:
+    if aperture_correction:
         found = wing_shares(cube, good, result, level_variance, detector, layout, reach=max_radius)
         if found is None:
             result.flag(True, "no aperture correction")
@@ -115,11 +113,11 @@ def _check(radius, factor, max_radius, annulus, companion, max_masked, correctio
     for name, value in (("companion", companion), ("max_masked", max_masked)):
         if not 0 <= value < 1:
             raise ParameterError(f"{name} = {value:g}; allowed is 0 and above, below 1")
-    check_choice("aperture_correction", correction, (False, True, "growth"), ParameterError)
-    if correction is True and not layout.two_beams:
+    check_choice("aperture_correction", correction, (False, True), ParameterError)
+    if correction and not layout.two_beams:
         raise ParameterError(
             f"aperture_correction = True for the beams {', '.join(layout.beams)}; the profile of "
-            "the wings is that of two beams, allowed are False and 'growth'"
+            "the wings is that of two beams"
         )
 
 
@@ -249,10 +247,10 @@ def growth_radius(image, places, largest, fraction=0.99):
 _Cube = namedtuple("_Cube", "cube good fits origin detector edge annulus max_masked")
 
 
-def _measured(cube, result, k, radius):
+def _measured(cube, result, k):
     """Return what `_aperture` does of each beam in a slice, (4, n_beams), or why it cannot."""
     places = np.stack([result.x[:, k], result.y[:, k]], axis=1)
-    found = [_aperture(cube, k, beam, places, radius) for beam in range(len(places))]
+    found = [_aperture(cube, k, beam, places, result.radius[0, k]) for beam in range(len(places))]
     wrong = [one for one in found if isinstance(one, str)]
     return wrong[0] if wrong else np.transpose(found)
 
@@ -323,26 +321,8 @@ def _aperture(cube, k, beam, places, radius):
     return flux, alone + of_level + unsure, level, of_level
 
 
-def _growth_shares(result, cube, reach):
-    """Return which part of the flux in wider circles both beams together have, and its noise."""
-    share, spread = np.full((2, len(result.reasons)), np.nan)
-    for k in np.flatnonzero(~result.failed):
-        wide = _measured(cube, result, k, reach)
-        if isinstance(wide, str):
-            continue
-        total = wide[0].sum()
-        share[k] = result.flux[:, k].sum() / total
-        beyond = max((wide[1] - result.variance[:, k]).sum(), 1e-12 * wide[1].sum())
-        spread[k] = share[k] * np.sqrt(beyond) / total
-    known = np.isfinite(share)
-    return share[known], np.diag(spread[known] ** 2), known
-
-
 def _correct(result, share, covariance, known):
     """Divide fluxes by the part of the light that they are."""
-    if not known.any():
-        result.flag(True, "no aperture correction")
-        return
     # smooth over wavelength: the noise of the wings must not enter the fluxes
     smooth, error = _smooth(share, covariance, known)
     result.flag(smooth <= 0.0, "no aperture correction")

@@ -1,7 +1,6 @@
 # Licensed under a 3-clause BSD style license - see LICENSE
 """The wavelength dependence of interstellar polarization."""
 
-from functools import partial
 from typing import NamedTuple
 
 import astropy.units as u
@@ -180,23 +179,18 @@ class SerkowskiLaw(Fittable1DModel):
 
     @property
     def fit_deriv(self):
-        """Derivatives by the parameters, or None if a tie of the user's makes them wrong."""
-        ties = {name: tie for name, tie in self.tied.items() if tie}
-        if not ties:
-            return self._columns
-        # astropy drops the columns of tied parameters, so theirs must be in that of their source:
-        # the chain rule through K = intercept + slope * lambda_max
-        return partial(self._columns, slope=_SLOPE) if ties == {"K": whittet_width} else None
+        """Derivatives by the parameters, or None with a tie, of which astropy drops the column."""
+        return None if any(self.tied.values()) else self._columns
 
     @staticmethod
-    def _columns(x, p_max, lambda_max, K, theta, rotation, slope=0.0):
+    def _columns(x, p_max, lambda_max, K, theta, rotation):
         shape, log = serkowski(np.asarray(x, dtype=float), lambda_max, K)
         degree = p_max * shape
         none = np.zeros_like(shape)
         # d/dp_max, d/dlambda_max, d/dK of p_max exp(-K ln^2(lambda_max /
         # lambda)); the degree does not depend on the angle
         by_width = -(log**2) * degree
-        by_maximum = -2 * K * log / lambda_max * degree + slope * by_width
+        by_maximum = -2 * K * log / lambda_max * degree
         return [shape, by_maximum, by_width, none, none]
 
     def angle(self, wavelength):

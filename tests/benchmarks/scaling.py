@@ -48,11 +48,11 @@ def seconds(model, repeats=15):
     vector = model.vector()
 
     def predict():
-        model._last = (None, None)
+        model._last = (None, None, {})
         return model.predict(vector)
 
     def jacobian():
-        model._last = (None, None)
+        model._last = (None, None, {})
         return model.jacobian(vector)
 
     return fastest(predict, jacobian, repeats=repeats)

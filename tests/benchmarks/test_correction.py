@@ -11,12 +11,10 @@ import tracemalloc
 import astropy.units as u
 import numpy as np
 import pytest
-from scipy.ndimage import affine_transform
 from timing import fastest
 
 from astropolcal import instruments
 from astropolcal.correction import ScienceFrames, correct
-from astropolcal.correction.geometry import derotate
 
 N_FRAMES = 100
 #: Cubes of CHARIS; the two beams of a frame are two such arrays.
@@ -77,28 +75,6 @@ def test_speed(beams, chain, measured, workers):
     measured(f"correction of {N_FRAMES} cubes of 22 x 201 x 201{threads}", ours, others)
     # threads of a busy machine wait for each other
     assert ours < GOAL * (copied if workers is None else summed)
-
-
-def test_derotation_of_cubes(measured):
-    """All slices at once, against a call of scipy for each, as cubes of both beams come."""
-    rng = np.random.default_rng(1)
-    pair = [rng.normal(size=SHAPE) for _ in "rl"]
-    angles = iter(np.linspace(0.0, 300.0, 1000))
-
-    def ours():
-        angle = next(angles) * u.deg
-        return [derotate(cube, angle) for cube in pair]
-
-    def theirs():
-        angle = np.deg2rad(next(angles))
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        start = np.array([100, 100]) - turn @ [100, 100]
-        return [[affine_transform(image, turn, start, mode="mirror") for image in cube]
-                for cube in pair]  # fmt: skip
-
-    times = fastest(ours, theirs, repeats=7, clock=time.process_time)
-    measured("derotation of a frame, 2 x 22 slices", times[0], {"scipy, slice by slice": times[1]})
-    assert times[1] > 2 * times[0]
 
 
 @pytest.mark.parametrize("n_frames", [50, 200])

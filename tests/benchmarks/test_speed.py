@@ -58,7 +58,7 @@ def measurement(observations):
 
 def forget(measurement):
     """Undo the memory of the last sweep, so that each call does its work."""
-    measurement._last = (None, None)
+    measurement._last = (None, None, {})
 
 
 # --- absolute, with pytest-benchmark ------------------------------------------------------

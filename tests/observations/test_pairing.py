@@ -222,7 +222,8 @@ def test_frames_of_one_exposure_are_paired_though_others_are_nearer():
         observations = exposed(column)
         assert observations.pairs().tolist() == [[0, 2], [3, 1]], column
     states = exposed([10, 20, 10, 20] * u.s, hwp=np.zeros(4) * u.deg, flc_state=list("ABBA"))
-    assert states.paired_by("flc_state").pairs().tolist() == [[0, 2], [3, 1]]
+    states.meta["pairing"] = "flc_state"
+    assert states.pairs().tolist() == [[0, 2], [3, 1]]
 
 
 def test_pairs_of_unequal_exposures_are_told():

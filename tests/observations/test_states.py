@@ -104,9 +104,10 @@ def test_plate_without_partner_is_named_by_its_row():
 def test_a_state_is_never_paired_with_the_other_by_the_plate():
     obs = modulated((0, 0, 45, 45), "ABBA")
     assert obs.pairs().tolist() == [[0, 3], [1, 2]]
-    assert obs.paired_by("flc_state").pairs().tolist() == [[0, 1], [3, 2]]
     assert obs.groups(4).tolist() == [[0, 1, 3, 2]]
     assert obs.groups(1).tolist() == [[0], [1], [2], [3]]
+    obs.meta["pairing"] = "flc_state"
+    assert obs.pairs().tolist() == [[0, 1], [3, 2]]
     # the nearest frame 45 deg away is in the other state
     assert modulated((0, 0, 45, 45), "ABAB").pairs().tolist() == [[0, 2], [1, 3]]
 
@@ -149,8 +150,6 @@ def test_a_table_without_any_pair_is_an_error():
 def test_unknown_pairing_is_refused():
     obs = modulated((0, 0, 45, 45), "ABAB")
     words = "night: pairing of the meta = 'time'; allowed are hwp, flc_state"
-    with pytest.raises(ObservationError, match=words):
-        obs.paired_by("time")
     obs.meta["pairing"] = "time"
     with pytest.raises(ObservationError, match=words):
         obs.pairs()
@@ -159,5 +158,5 @@ def test_unknown_pairing_is_refused():
 def test_time_of_the_table_decides():
     # two cycles; the second A is nearer in time to the first B
     obs = modulated((0, 0, 0, 0), "ABAB", time=[0.0, 50.0, 49.0, 100.0])
-    found = obs.paired_by("flc_state").pairs().tolist()
-    assert found == [[0, 3], [2, 1]]
+    obs.meta["pairing"] = "flc_state"
+    assert obs.pairs().tolist() == [[0, 3], [2, 1]]

@@ -699,7 +699,7 @@ def test_one_beam_and_four_beams_are_measured_as_two_are(tmp_path):
         background = 20.0 * 20**2
         wanted = (2e5 * shares[-1] + background) / (2e5 + background)
         np.testing.assert_allclose(ratio, wanted, rtol=0.02)
-        with pytest.raises(ParameterError, match="allowed are False and 'growth'"):
+        with pytest.raises(ParameterError, match="the profile of the wings is that of two beams"):
             reduce_run(files, star, source="star", aperture_correction=True)
         with pytest.raises(ParameterError, match="they are of right and left"):
             save_quicklook(reduce_run(files, star, source="star"), folder)

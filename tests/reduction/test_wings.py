@@ -89,9 +89,7 @@ def test_without_it_the_wings_are_missing():
     """What the fluxes lack is not noise; a test of the tests above."""
     cube, true = exposure(scene(*PROFILES["Moffat 3, halo"]), 1)
     plain = measure_stars(cube, None, DETECTOR, LAYOUT)
-    wide = measure_stars(cube, None, DETECTOR, LAYOUT, aperture_correction="growth")
     assert (plain.flux / true).max() < 0.92
-    assert (wide.flux / true).max() < 0.98
 
 
 def test_both_beams_have_the_same_factor():
