@@ -156,7 +156,6 @@ def _in_part(chains, observations, misfit, effects, say):
     With them, chains and datasets, one of these in two parts, and the name of that which does not
     fit. Without such a part they are as they were, and the name is empty.
     """
-
     most = _SETTLED * misfit
 
     def tried(effects, *edge):
