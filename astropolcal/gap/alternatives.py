@@ -136,7 +136,7 @@ def _by_stages(chains, observations, effects, say, enough, least, most):
     """Return misfit and effect of alternatives, best first; rarer ones if others are above a least.
 
     One that leaves no more than is enough gives way only to what is far better; what leaves more
-    than the most is no answer.
+    than the most does not count.
     """
     # tables are seldom misread, and more seldom by several frames
     misread = [e for e in effects if isinstance(e, Misread)]
@@ -311,7 +311,7 @@ def _tried(chains, observations, effects, say, known, most):
 def _tried_misfit(chains, observations, most=np.inf):
     """Return the misfit after a few steps of everything, infinite where frames are too few.
 
-    It is told less exactly where it is above the ``most`` that counts.
+    It is less exact where it is above the ``most`` that counts.
     """
     # of what is not the answer a user is not warned
     with warnings.catch_warnings(), suppress(ObservationError):
