@@ -52,8 +52,9 @@ _LEAST_PART, _FITS, _SUDDEN = 4, 0.1, 4
 _EQUAL = 1e-3
 _FEW = 3
 # what alternatives leave is told after so many searches and steps: further ones lower it by less
-# than a quarter, mostly
-_SEARCHES, _STEPS = 2, 15
+# than a quarter, mostly; and what leaves so many times as much as counts after the first is not
+# searched again
+_SEARCHES, _STEPS, _HOPELESS = 2, 15, 1.5
 
 
 def starting_model(calibration, observations, library, say):
@@ -115,6 +116,7 @@ def _alternatives(chains, observations, made, discrete, say):
     misfit, asked, where = _misfit(made), (chains, observations, made), ""
     enough, least = _SETTLED * misfit, _ABOVE_NOISE * _usual(made, "sigma")
     stages = {"enough": enough, "least": least if np.isfinite(least) else enough}
+    stages["most"] = _FAR_BETTER * misfit
     found = _by_stages(chains, observations, discrete, say, **stages)
     settled = bool(found) and found[0][0] <= enough
     if not settled:
@@ -132,10 +134,11 @@ def _alternatives(chains, observations, made, discrete, say):
     return found, asked, where
 
 
-def _by_stages(chains, observations, effects, say, enough, least):
+def _by_stages(chains, observations, effects, say, enough, least, most):
     """Return misfit and effect of alternatives, best first; rarer ones if others are above a least.
 
-    One that leaves no more than is enough gives way only to what is far better.
+    One that leaves no more than is enough gives way only to what is far better; what leaves more
+    than the most does not count.
     """
     # tables are seldom misread, and more seldom by several frames
     misread = [e for e in effects if isinstance(e, Misread)]
@@ -143,7 +146,7 @@ def _by_stages(chains, observations, effects, say, enough, least):
     for some in (signs, misread, [way for e in misread for way in e.farther()]):
         before = found[0][0] if found else np.inf
         if not before <= least:
-            more = _tried(chains, observations, some, say, found)
+            more = _tried(chains, observations, some, say, found, most)
             gives_way = before > enough or more[0][0] < _FAR_BETTER * before
             found = more if gives_way else found
     return found
@@ -155,18 +158,19 @@ def _in_part(chains, observations, misfit, effects, say):
     With them, chains and datasets, one of these in two parts, and the name of that which does not
     fit. Without such a part they are as they were, and the name is empty.
     """
+    most = _SETTLED * misfit
 
-    def tried(*edge):
+    def tried(effects, *edge):
         *parts, where = _split(chains, observations, *edge)
         apart = [e.in_run(where) for e in effects]
-        found = _by_stages(*parts, apart, say, _SETTLED * misfit, _SETTLED * misfit)
-        return [one for one in found if one[0] < _SETTLED * misfit], parts, where
+        found = _by_stages(*parts, apart, say, most, most, most)
+        return [one for one in found if one[0] < most], parts, where
 
     say("where the model begins to fail")
     edge = _edge(chains, observations, misfit)
     if edge is None:
         return [], (chains, observations), ""
-    found, parts, where = tried(*edge)
+    found, parts, where = tried(effects, *edge)
     if found:
         i, order, words, good = edge
         best = nominal_calibration(*_read(found[0][1], *parts))
@@ -174,7 +178,9 @@ def _in_part(chains, observations, misfit, effects, say):
         new, sure = _nearer(best.chains[i : i + 2], observations[i], order, words)
         # a part of another length, or of other frames; none, or all of them, are no part
         moved = 0 < sure < len(order) and (sure != good or np.any(new != order))
-        again = tried(i, new, words, sure) if moved else ([],)
+        names = {one.name.partition("/")[0] for _, one in found}
+        some = [e for e in effects if e.name in names]
+        again = tried(some, i, new, words, sure) if moved else ([],)
         found, parts, where = again if again[0] else (found, parts, where)
     return found, parts, where
 
@@ -288,7 +294,7 @@ def _set_apart(chains):
     return [join(optics) for optics in found] if known else chains
 
 
-def _tried(chains, observations, effects, say, known):
+def _tried(chains, observations, effects, say, known, most):
     """Return misfit and effect of alternatives at a few wavelengths, and known ones, best first."""
     few, found = thinned(chains, observations, _FEW), list(known)
     for effect in effects:
@@ -296,7 +302,7 @@ def _tried(chains, observations, effects, say, known):
         for one in effect.ways():
             # where it leaves too few frames, or none, it is not asked for
             with suppress(ObservationError):
-                found.append((_tried_misfit(*_read(one, *few)), one))
+                found.append((_tried_misfit(*_read(one, *few), most), one))
     found = [one for one in found if np.isfinite(one[0])]
     misfits, best = np.array([misfit for misfit, _ in found]), {}
     for i in ranked(-misfits, _EQUAL * misfits.min(initial=np.inf)):
@@ -304,8 +310,11 @@ def _tried(chains, observations, effects, say, known):
     return list(best.values())
 
 
-def _tried_misfit(chains, observations):
-    """Return the misfit after a few steps of everything, infinite where frames are too few."""
+def _tried_misfit(chains, observations, most=np.inf):
+    """Return the misfit after a few steps of everything, infinite where frames are too few.
+
+    It is less exact where it is above the ``most`` that counts.
+    """
     # of what is not the answer a user is not warned
     with warnings.catch_warnings(), suppress(ObservationError):
         warnings.simplefilter("ignore", AstropolcalWarning)
@@ -319,6 +328,8 @@ def _tried_misfit(chains, observations):
             for _ in range(_SEARCHES):
                 vector = search_branches(problem, vector, start)[0]
                 vector = problem.fit(vector, evaluations=_STEPS)[0]
+                if rms(measurement.residuals(vector)) > _HOPELESS * most:
+                    break
         return rms(measurement.residuals(vector))
     return np.inf
 

@@ -48,6 +48,8 @@ _SKY = ("parallactic", "altitude")
 _HARMONICS = (1, 2, 3, 4)
 # steps are looked for at so many frames, and the best of them at those in between
 _MOST_STEPS = 16
+# in so few frames a step is that of one that is wrong, beside others that a cell hardly changes
+_FEW = 3
 # functions of the frame that differ by less are the same
 _SAME = 1e-9
 # size (radian) of a retardance that is tried where its derivative vanishes
@@ -333,15 +335,23 @@ def dependences(problem):
     found = {}
     for name in names:
         waves = [_waves(Dependence(name), dataset) for dataset in problem.datasets]
-        if name == "constant" or _varies(waves, problem):
+        if name == "constant" or _varies(name, waves, problem):
             found[name] = waves
     return found
 
 
-def _varies(waves, problem):
-    """Return whether functions, (count, F) per dataset, differ between frames that have data."""
+def _varies(name, waves, problem):
+    """Return whether functions, (count, F) per dataset, differ between frames that have data.
+
+    What differs in one frame only, or steps in a few, is a fault of these frames.
+    """
     seen = [w[:, c.valid.any(axis=0)] for w, c in zip(waves, problem.channels, strict=True)]
-    return np.ptp(np.concatenate(seen, axis=1), axis=1).max() > _SAME
+    few, seen = (_FEW, seen) if name.startswith("step:") else (1, [np.concatenate(seen, axis=1)])
+    seen = [np.sort(one, axis=1) for one in seen if one.shape[1] > few]
+    return any(
+        np.minimum(one[:, -1 - few] - one[:, 0], one[:, -1] - one[:, few]).max() > _SAME
+        for one in seen
+    )
 
 
 _MOVED = ("direction", "move")
@@ -482,11 +492,12 @@ class Probes:
         frames = sorted(int(step[5:]) for step, where in known if where == run)
         at = int(text[5:])
         before = max((frame for frame in frames if frame < at), default=0)
-        after = min((frame for frame in frames if frame > at), default=at + 1)
+        last = max(one.shape[1] for one in self.ones)
+        after = min((frame for frame in frames if frame > at), default=last)
         others = [f"step:{frame}" for frame in range(before + 1, after) if frame != at]
         others = others if run is None else [f"{name}/dataset:{run}" for name in others]
         near = [replace(cell, dependence=name) for name in others]
-        return [one for one in near if _varies(self.waves_of(one), self.problem)]
+        return [one for one in near if _varies(one.dependence, self.waves_of(one), self.problem)]
 
     def _at_places(self):
         """Return the derivative of both channels to a constant perturbation, by place and kind."""

@@ -271,17 +271,20 @@ def _of_a_while(look, found):
     """Return the faults; of frames in a row no angle is to blame, unless a stage did not move.
 
     Something may have changed for a while: light that arrives turned looks like a half-wave plate
-    that is, and that each move of a stage failed is no more probable.
+    that is, and that each move of a stage failed is no more probable. Nor is one beam to blame, and
+    then the other: light that arrives depolarized looks so.
     """
-    off = {one.place: one.what for one in found if one.what.endswith(_FOR_A_WHILE)}
+    off = {one.place: (one.what, one.beam) for one in found if one.what.endswith(_FOR_A_WHILE)}
     for fault in found:
         (i, f), stage = fault.place, fault.what.removesuffix(" angle")
         near = [k for k in (f - 1, f + 1) if (i, k) in off]
-        if stage == fault.what or look.problem.channels[i].groups is not None:
+        is_known = fault.place in off and fault.what != "unknown"
+        if not is_known or look.problem.channels[i].groups is not None:
             continue
-        stood = np.atleast_1d(look.problem.datasets[i]._given[stage])
-        if any(stood[k] != stood[f] or off[i, k] != fault.what for k in near):
-            fault.what, fault.value, fault.error = "unknown", None, None
+        # a beam has no angle that could move
+        stood = np.atleast_1d(look.problem.datasets[i]._given.get(stage, np.zeros(f + 2)))
+        if any(stood[k] != stood[f] or off[i, k] != off[i, f] for k in near):
+            fault.what, fault.value, fault.error, fault.beam = "unknown", None, None, None
             fault.words += ", or something else changed for a while"
     return found
 

@@ -54,14 +54,14 @@ def differences(model, cell, dataset=0):
 
 
 def test_a_step_among_masked_frames_is_no_dependence():
-    """It would be the same as a constant, and take a part of its probability."""
+    """It would be the same as a constant, or the fault of the few frames before it."""
     seen = data.observed()
     clouds = np.tile((np.arange(seen.n_frames) < 9)[:, None], seen.n_bins)
     model = data.fitted(seen.with_mask(clouds, "clouds"))
     probes, cell = Probes(model), Cell("after:hwp", "rotation", "step:11")
     names = [*dependences(model.problem), *(one.dependence for one in probes.steps_near(cell))]
     steps = [int(name[5:]) for name in names if name.startswith("step:")]
-    assert min(steps) == 10
+    assert min(steps) == 13
     assert "step:9" in dependences(data.fitted(seen).problem)
 
 
@@ -129,7 +129,8 @@ def test_only_what_data_can_tell_is_a_dependence():
         assert name == "constant" or np.ptp(waves[0]) > 0, name
         assert waves[0].shape == (2 if name.startswith("harmonic") else 1, 32)
     steps = [name for name in whole if name.startswith("step")]
-    assert len(steps) == 16
+    # of 16 the first and the last would be faults of two frames
+    assert len(steps) == 14
     # one plate angle and one derotator angle are no harmonics, and a short run has no steps
     table = half_wave_plate_cycles(np.zeros(6) * u.deg, [45] * u.deg)
     assert set(of(data.observed(table=table))) == {"constant", "time", "time2", "brightness"}

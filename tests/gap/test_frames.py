@@ -12,7 +12,7 @@ from astropy.table import QTable
 from gap_setups import SETUPS
 
 from astropolcal import instruments, optics
-from astropolcal.chain import join
+from astropolcal.chain import insert_optic, join
 from astropolcal.gap._bench import Bench
 from astropolcal.gap.challenge import Setup, make_challenge, score_answer
 from astropolcal.gap.diagnosis import diagnose
@@ -100,6 +100,20 @@ def test_angles_of_frames_in_a_row_may_be_something_else():
     assert sorted(fault.frame for fault in faults) == [18, 19]
     assert {fault.what for fault in faults} == {"unknown"}
     assert all("half-wave plate at" in fault.words for fault in faults)
+
+
+def test_one_beam_after_the_other_may_be_something_else():
+    """Light that arrives depolarized for a while looks so where a lamp flickers."""
+    clouds = optics.Depolarizer(retained_q=0.99, retained_u=0.99, name="clouds")
+    cloudy = insert_optic(data.chain(), clouds, before="hwp")
+    lamp = np.exp(np.random.default_rng(101).normal(0, 0.05, N))
+    seen, other = (observed(true=true, lamp=lamp).to_table() for true in (None, cloudy))
+    for beam in ("flux_right", "flux_left"):
+        seen[beam] = np.where(np.isin(seen["frame"], (42, 43)), other[beam], seen[beam])
+    faults = harmful(found(Observations.from_table(seen, name="lamp")))
+    assert sorted(fault.frame for fault in faults) == [42, 43]
+    assert {(fault.what, fault.beam) for fault in faults} == {("unknown", None)}
+    assert any("beam is off by" in fault.words for fault in faults)
 
 
 def test_exchanged_frames_are_named_with_each_other():

@@ -250,6 +250,24 @@ def test_a_gain_of_one_run_that_drifts():
 
 
 @pytest.mark.long
+def test_an_angle_that_differs_is_told_where_no_cause_is_sure():
+    """Plates that reach no angle exactly hide the cause, and not what the runs differ in."""
+    few, runs = data.WAVELENGTH[::3], []
+    for seed, move in enumerate((0.0, 2.0)):
+        true, frames = data.chain(few), data.frames()
+        true["derotator"].theta.value += move
+        errors = np.random.default_rng(seed).normal(0, 0.3, len(frames))
+        frames["hwp"] += errors * u.deg
+        table = data.observed(true, seed=seed, table=frames, wavelength=few).to_table()
+        table["hwp"] = np.repeat(data.frames()["hwp"], len(few))
+        runs.append(Observations.from_table(table, name=f"run {seed}"))
+    found = diagnose(data.chain(few), runs, changes=True, cross_validate=False)
+    assert found.verdict == "unexplained"
+    words = "derotator.theta differs in run 1 by +2 deg"
+    assert any(words in sentence for sentence in to_dict(found)["sentences"])
+
+
+@pytest.mark.long
 def test_what_an_optic_of_one_run_brought():
     parts = list(leaves(data.chain()))
     dichroic = LinearRetarder(name="dichroic", fixed={"retardance": True})
