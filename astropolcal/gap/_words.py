@@ -42,10 +42,9 @@ _ONE_THING = {
     "": "",
 }
 # what no table has, by place and kind of what does the same if it changes: in simulations up to
-# 93 % of the signal of added light, 99 % of that of one beam, 92 to 99 % of that of a scale
+# 93 % of the signal of added light, 92 to 99 % of that of a scale
 _NOT_ASKED = (
     ("after:", "depolarization", "Added light, such as a background, that changes so"),
-    ("after:", "diattenuation_c", "Other wavelengths, or another band, of one of the beams"),
     ("in:", "retardance_h", "A wavelength scale that changes so"),
 )
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
