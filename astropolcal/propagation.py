@@ -215,8 +215,8 @@ class Sweep:
         """Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
 
         A change of the matrix by E changes the sum by a . E s, with the light s that enters the
-        optic and the analyser row a downstream of it. Of each ``wanted`` index of an optic: pairs of
-        a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic, one for each beam
+        optic and the analyser row a downstream of it. Of each ``wanted`` index of an optic: pairs
+        of a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic, one for each beam
         where their light differs.
         """
         found = {}
