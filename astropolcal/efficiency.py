@@ -51,7 +51,9 @@ def sky_path(chain):
     Of an internal source what stands before the first optic on a stage belongs to the source.
     """
     found = leaves(chain)
-    # the first optic that treats the two beams differently is the beam splitter
+    # what treats the light of the two beams differently upstream of the splitter is no part of it
+    split = next((i for i, leaf in enumerate(found) if leaf.splits_light), 0)
+    found = [leaf for leaf in found[:split] if not leaf.depends_on_beam] + found[split:]
     end = next((i for i, leaf in enumerate(found) if leaf.depends_on_beam), len(found))
     moving = (i for i, leaf in enumerate(found) if leaf.stage and leaf.stage not in COORDINATES)
     train = list(found[next(moving, end) : end])

@@ -215,14 +215,17 @@ class Sweep:
         """Return what any small change of the matrix of an optic does to a weighted sum of fluxes.
 
         A change of the matrix by E changes the sum by a . E s, with the light s that enters the
-        optic and the analyser row a downstream of it. Of each ``wanted`` index of an optic upstream
-        of the beam splitter: a and s, (n_wavelengths, n_columns, 4) each, in the frame of the
-        optic.
+        optic and the analyser row a downstream of it. Of each ``wanted`` index of an optic: pairs
+        of a and s, (n_wavelengths, n_columns, 4) each, in the frame of the optic, one for each beam
+        where their light differs.
         """
         found = {}
         self.derivatives([(index, _CROSSING) for index in wanted], weights, found)
         shape = (*self._propagator.shape, 4)
-        return {i: tuple(np.broadcast_to(x, shape) for x in pair) for i, pair in found.items()}
+        return {
+            i: [tuple(np.broadcast_to(x, shape) for x in pair) for pair in pairs]
+            for i, pairs in found.items()
+        }
 
     def derivatives(self, wanted, weights, crossings=None):
         """
@@ -239,11 +242,10 @@ class Sweep:
             by_optic.setdefault(optic, {})[parameter] = None
         adjoint, behind = 0.0, []
         # a dark beam has no arm
-        alone = crossings if len(self._arms) == 1 else None
         for steps, weight in zip(self._arms, weights, strict=False):
             row = np.zeros((*weight.shape, 4))
             row[..., 0] = weight
-            inward, pairs = _back(steps, row, [], by_optic, result, alone)
+            inward, pairs = _back(steps, row, [], by_optic, result, crossings)
             adjoint, behind = adjoint + inward, behind + pairs
         # upstream of the first optic that is asked for nothing is needed
         first = min(by_optic, default=len(self._common))
@@ -337,7 +339,7 @@ def _back(steps, adjoint, behind, by_optic, result, crossings=None):
             continue
         pair = [(act_back(step.matrix, adjoint), step.light)]
         if _CROSSING in wanted:
-            crossings[step.node.index] = (adjoint, step.light)
+            crossings.setdefault(step.node.index, []).append((adjoint, step.light))
         if 0 in wanted:
             # d/dtheta of T(-theta) M T(theta), with T' = 2 G T
             _add(result, (step.node.index, 0), 2 * (_crossed(pair) - _crossed(behind)))

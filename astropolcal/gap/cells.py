@@ -36,9 +36,13 @@ _DETECTED = {
 }
 #: Kinds that only a detector may have, and the dependence of each.
 DETECTED = {kind: dependence for kind, (dependence, _) in _DETECTED.items()}
+# what no matrix of one wavelength is: the beams see an optic at other wavelengths, or bands
+BETWEEN_BEAMS = "_between_beams"
+_RETARDANCE = f"retardance_h{BETWEEN_BEAMS}"
 # of these some may also drift or step; an angle may do that, too, and what follows a stage has a
 # name
 _COURSES = dict.fromkeys(("background", "background_of_one_beam"), ("time", "step"))
+_COURSES[_RETARDANCE] = ("constant",)
 _COURSES["orientation"] = ("time", "time2", "step", "direction", "move")
 # the components of an elliptical retarder
 _RETARDER = {"retardance_h", "retardance_d", "rotation"}
@@ -146,6 +150,7 @@ _KINDS = {
     "brightness": "brightness of the source, or gain",
     "gain_of_right_beam": "gain of the right beam",
     "gain_of_left_beam": "gain of the left beam",
+    _RETARDANCE: "retardance that differs between the beams (other wavelengths)",
     **{kind: words for kind, (_, words) in _DETECTED.items()},
 }
 
@@ -523,24 +528,30 @@ class Probes:
             sweep = dataset.forward(problem.vector(problem.start))
             names = {leaf.name: j for j, leaf in enumerate(dataset.propagator.leaves)}
             own = {p: names[_PROBE + p] for p in where if _PROBE + p in names}
-            both = [sweep.crossings(own.values(), w) for w in channel.slopes(sweep)]
+            weights = channel.slopes(sweep)
+            both = [sweep.crossings(own.values(), w) for w in weights]
+            apart = [sweep.crossings(own.values(), (right, -left)) for right, left in weights]
             for place, j in own.items():
                 if place.startswith(_FRONT):
                     inside = "in:" + place.removeprefix(_FRONT)
-                    slope = np.stack([_bilinear(*p[j], GENERATORS["rotation"]) for p in both])
+                    slope = np.stack([_bilinear(p[j], GENERATORS["rotation"]) for p in both])
                     slope = slope * channel.valid - found[inside, "rotation"][i]
                     found.setdefault((inside, "orientation"), {})[i] = slope
                     continue
                 for kind, generator in GENERATORS.items():
                     if kind == "gain":
                         continue
-                    slope = np.stack([_bilinear(*part[j], generator) for part in both])
+                    slope = np.stack([_bilinear(part[j], generator) for part in both])
                     found.setdefault((place, kind), {})[i] = slope * channel.valid
                     if kind.startswith("retardance") and place.startswith("in:"):
                         # of exp(x G), per size: at a size of FINITE it is half of this
-                        bend = np.stack([_bilinear(*p[j], generator @ generator) for p in both])
+                        bend = np.stack([_bilinear(p[j], generator @ generator) for p in both])
                         bend = FINITE / 2 * bend * channel.valid
                         self.bends.setdefault((place, kind), {})[i] = bend
+                if place.startswith("in:") and channel.groups is None:
+                    slope = [_bilinear(p[j], GENERATORS["retardance_h"]) for p in apart]
+                    slope = np.stack(slope) * channel.valid
+                    found.setdefault((place, _RETARDANCE), {})[i] = slope
             right, left = sweep.fluxes
             gain = np.stack([(one * right - other * left) for one, other in channel.slopes(sweep)])
             kind = "gain" if channel.groups is None else "brightness"
@@ -615,11 +626,12 @@ def _frames_first(basis, shape):
 _PROBE, _FRONT = "gap_probe_", "front:"
 
 
-def _bilinear(row, light, generator):
-    """Return a . G s of every wavelength and frame."""
-    out = np.zeros(row.shape[:-1])
-    for i, j in zip(*np.nonzero(generator), strict=True):
-        out += generator[i, j] * row[..., i] * light[..., j]
+def _bilinear(pairs, generator):
+    """Return a . G s of every wavelength and frame, the sum over pairs of a and s."""
+    out = np.zeros(pairs[0][0].shape[:-1])
+    for row, light in pairs:
+        for i, j in zip(*np.nonzero(generator), strict=True):
+            out += generator[i, j] * row[..., i] * light[..., j]
     return out
 
 

@@ -429,7 +429,8 @@ class Model:
             front = [i for i in range(found[0]) if not isinstance(optics[i], Rotator)][-1:]
             one, none = np.ones(sweep.fluxes[0].shape), np.zeros(sweep.fluxes[0].shape)
             for weights in ((one, none), (none, one)):
-                for row, _ in sweep.crossings(front, weights).values():
+                seen = sweep.crossings(front, weights).values()
+                for row, _ in (pair for pairs in seen for pair in pairs):
                     polarized = np.linalg.norm(row[..., 1:], axis=-1)
                     if np.any(polarized > row[..., 0] * (1 + _MORE_LIGHT)):
                         return False

@@ -53,8 +53,9 @@ class Dependence:
     and sine of N times the angle of a stage; ``"direction:STAGE"``, where the last move of the
     stage was backwards; ``"move:STAGE"``, how far it was moved, in radian;
     ``"state:COLUMN=STATE"``, in one state of a device or one beam; ``"brightness"``, by what share
-    the frame is brighter than the mean; ``"dataset:NAME"``, in one dataset only. With
-    ``"/dataset:NAME"`` after it, any of the others is in that dataset only.
+    the frame is brighter than the mean; ``"beam"``, with opposite signs for the light of the two
+    beams; ``"dataset:NAME"``, in one dataset only. With ``"/dataset:NAME"`` after it, any of the
+    others is in that dataset only.
     """
 
     def __init__(self, text):
@@ -62,7 +63,7 @@ class Dependence:
             raise ParameterError(
                 f"dependence = {text!r}; allowed are constant, time, time2, step:FRAME, "
                 "frame:FRAME, harmonic:STAGE:N, direction:STAGE, move:STAGE, "
-                "state:COLUMN=STATE, brightness and dataset:NAME, each also with "
+                "state:COLUMN=STATE, brightness, beam and dataset:NAME, each also with "
                 "/dataset:NAME after it"
             )
         self.text = text
@@ -77,7 +78,7 @@ class Dependence:
     @property
     def driver(self):
         """Name of the position that it follows, None where it is constant."""
-        if self.kind in ("constant", "dataset"):
+        if self.kind in ("constant", "beam", "dataset"):
             return None
         if self.kind in ("harmonic", "state"):
             return self.parts[1]
@@ -97,13 +98,14 @@ class Dependence:
             at = int(self.parts[1])
             return np.array([x >= at if self.kind == "step" else x == at], dtype=float)
         one, t = np.ones_like(x), 2 * x - 1
-        known = {"constant": one, "dataset": one, "time": t, "time2": t**2 - 1 / 3}
+        known = dict.fromkeys(("constant", "beam", "dataset"), one)
+        known |= {"time": t, "time2": t**2 - 1 / 3}
         # direction, move, state and brightness are what they follow
         return known.get(self.kind, x)[None]
 
 
 _FORMS = re.compile(
-    r"(constant|time2?|brightness|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+"
+    r"(constant|time2?|brightness|beam|(step|frame):\d+|harmonic:\w+:[1-9]\d?|(direction|move):\w+"
     r"|state:\w+=[^/:]+)"
     r"(/dataset:.+)?|dataset:.+",
     re.DOTALL,
@@ -157,10 +159,11 @@ class Perturbation(_BeamOptic, _Modulated):
         ``"step:N"``, from frame N on; ``"frame:N"``; ``"harmonic:STAGE:N"``, cosine and sine of N
         times the angle of a stage; ``"direction:STAGE"`` and ``"move:STAGE"``, the last move of a
         stage; ``"state:COLUMN=STATE"``, in one state or beam; ``"brightness"``, by what share the
-        frame is brighter than the mean; ``"dataset:NAME"``; each also with ``"/dataset:NAME"``
-        after it. The ``mount`` has to be what it follows.
+        frame is brighter than the mean; ``"beam"``, with the opposite sign for the light that
+        becomes the left beam, as other wavelengths in one beam make it; ``"dataset:NAME"``; each
+        also with ``"/dataset:NAME"`` after it. The ``mount`` has to be what it follows.
     beam : {"right", "left"}
-        The beam that goes on in a chain; of consequence for ``"gain"`` only.
+        The beam that goes on in a chain; of consequence for ``"gain"`` and ``"beam"`` only.
     theta : `~astropy.units.Quantity`
         Orientation of the axes.
 
@@ -211,14 +214,15 @@ class Perturbation(_BeamOptic, _Modulated):
 
     @property
     def depends_on_beam(self):
-        """True for a gain, which has opposite signs in the two beams."""
-        return self._kind == "gain"
+        """True for a gain and the dependence ``"beam"``: opposite signs in the two beams."""
+        return self._kind == "gain" or self._dependence.kind == "beam"
 
     def _settings(self):
         return super()._settings() | {"kind": self.kind, "dependence": self.dependence}
 
     def _waves(self, coordinate):
         waves = self._dependence.waves(coordinate)
+        waves = waves * BEAMS[self._beam] if self._dependence.kind == "beam" else waves
         return waves if len(waves) == 2 else (waves[0], np.zeros_like(waves[0]))
 
     def _of(self, x):

@@ -14,7 +14,8 @@ from astropy.table import QTable, Table
 from gap_setups import SETUPS
 
 from astropolcal import instruments, optics
-from astropolcal.chain import insert_optic
+from astropolcal.chain import insert_optic, leaves
+from astropolcal.efficiency import sky_path
 from astropolcal.gap.attribution import Candidate, Scan
 from astropolcal.gap.cells import Cell
 from astropolcal.gap.challenge import Setup, make_challenge, score_answer
@@ -111,6 +112,27 @@ def test_a_lamp_whose_polarization_follows_its_flux_is_told_beside_a_background(
         (group,) = chosen(setup, seen).groups
         assert group.probability > 0.9
         assert {lamp, background} <= set(names(group)), names(group)
+
+
+@pytest.mark.slow
+def test_beams_of_other_wavelengths_are_no_optic_that_turns():
+    """To first order they are circular diattenuation that follows the derotator, of some phase."""
+    setup = SETUPS["charis"]()
+    one, other = (
+        setup.observed(setup.with_cell(Cell("in:derotator", "retardance_h", "constant"), size))
+        for size in (0.01, -0.01)
+    )
+    table = one.to_table()
+    table["flux_left"] = other.flux_left.ravel() * table["flux_left"].unit
+    (group,) = chosen(setup, type(one).from_table(table, name=one.name)).groups
+    assert group.probability > 0.9
+    assert group.best.name == "in:derotator/retardance_h_between_beams/constant"
+    # what corrects for it is no part of the path of the light from the sky
+    (beams,) = (chain for chain in nominal_model([setup.nominal], [one]).chains)
+    found = optics.Perturbation(dependence="beam", name="found")
+    assert [leaf.name for leaf in leaves(sky_path(insert_optic(beams, found, after="hwp")))] == [
+        leaf.name for leaf in leaves(sky_path(beams))
+    ]
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from astropy.modeling import models
 from astropolcal import instruments, optics
 from astropolcal.chain import Train, insert_optic
 from astropolcal.exceptions import GapError, InstrumentError, ParameterError
-from astropolcal.gap.cells import Cell, places
+from astropolcal.gap.cells import BETWEEN_BEAMS, Cell, places
 from astropolcal.gap.effects.where import SEVERAL, Roles, Where
 from astropolcal.gap.problem import law_basis
 from astropolcal.measurement import Tie
@@ -776,6 +776,9 @@ class CellEffect(Effect):
             if cell.kind in _IN_FRONT:
                 place = Where("before", "splitter", True, otherwise=Where("detector"))
         kind = "gain" if cell.kind == "brightness" else cell.kind
+        if kind.endswith(BETWEEN_BEAMS):
+            kind = kind.removesuffix(BETWEEN_BEAMS)
+            dependence = "beam" if cell.run is None else f"beam/dataset:{cell.run}"
         super().__init__(cell.name, cell.title, place, kind, dependence, degree, **settings)
         self._cell = cell
 
