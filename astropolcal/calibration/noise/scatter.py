@@ -120,8 +120,9 @@ _FEWEST_SETTINGS = 3
 # without it, all with 4 settings, and 4 are
 _BY_CHANCE = 8.0
 # shares below so many times their error under independence count as chance; those of stages, which
-# have few angles, below what independent data exceed with this probability: of 240 runs without
-# errors of stages 3 had a share (one dataset each), and of 120 of IRDIS with a wrong plate 79
+# have few angles, below what independent data exceed with this probability: of 180 runs without
+# errors of stages 2 had a share, of 40 of IRDIS with five degrees of freedom 5 at most, and of 120
+# of IRDIS with a wrong plate 79
 _CHANCE, _BY_LUCK = 2.0, 0.01
 # share of the scatter that is independent from datum to datum at the least
 _INDEPENDENT = 0.05
