@@ -498,8 +498,9 @@ def courses(calibrations, parameters=None, *, events=()):
         between which calibrations it changed (95 %); ``or``, what would explain them nearly as well
         in its place. ``meta["calibrations"]`` and ``meta["dates"]`` name the runs,
         ``meta["steps"]`` those before and after each step, row by row, with its probability and
-        what may be in its place, and ``meta["n_open"]`` is
-        the number of directions that one of the calibrations does not determine; they take no part.
+        what may be in its place, ``meta["rivals"]`` the names of ``or``, row by row, and
+        ``meta["n_open"]`` is the number of directions that one of the calibrations does not
+        determine; they take no part.
 
     Raises
     ------
@@ -542,14 +543,15 @@ def courses(calibrations, parameters=None, *, events=()):
             )
     dates = Time(told, scale="tai")
     _check_independent(named)
-    found, rows, spans = compared(named, parameters), [], []
+    found, rows, spans, rivals = compared(named, parameters), [], [], []
     if found.slopes.size:
         # something is determined in all of them
         model = Model(_Standing(found, named[0][1]), (), dates, events)
         model.search()
-        rows, spans = model.courses()
+        rows, spans, rivals = model.courses()
     table, names = Table(rows=rows), [name for name, _ in named]
     table.meta |= {"calibrations": names, "dates": dates.isot.tolist(), "n_open": found.n_open}
+    table.meta["rivals"] = rivals
     table.meta["steps"] = [
         [(names[a], names[b + 1], *told) for a, b, *told in own] for own in spans
     ]

@@ -166,23 +166,23 @@ def _group(entries, rows, moment, goal, limit, events):
 def _what_changed(found, dated):
     """Return the courses of all optics, and the steps that are likely, ready for JSON."""
     told_courses, events = [], []
-    doubtful = {optic(one) for row in found for one in row["or"].split(", ")}
-    for row, steps in zip(found, found.meta["steps"] if len(found) else (), strict=True):
+    told = [found.meta[key] for key in ("rivals", "steps")] if len(found) else [(), ()]
+    doubtful = {optic(one) for rivals in told[0] for one in rivals}
+    for row, rivals, steps in zip(found, *told, strict=True):
         what, course = row["what"], row["course"]
         if course == "constant" and what in doubtful:
             # it may be what another row says of another optic
             continue
-        rivals = [one for one in row["or"].split(", ") if one]
         known = {"what": what, "or": rivals, "course": course}
         words = (
             f"{listed([what, *rivals], 'or')} {_COURSE_WORDS[course]} ({100 * row[course]:.0f} %)"
         )
         told_courses.append(known | {name: row[name] for name in COURSES} | {"words": words})
         for before, after, surely, others in (one for one in steps if one[2] >= LIKELY):
-            told = listed([what, *others], "or")
+            which = listed([what, *others], "or")
             days = [_start(e)[:10] for e in dated if e.name in (before, after)]
-            words = f"{told} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
-            one = {"what": told, "before": before, "after": after, "from": days[0], "to": days[1]}
+            words = f"{which} changed between {days[0]} and {days[1]} ({100 * surely:.0f} %)"
+            one = {"what": which, "before": before, "after": after, "from": days[0], "to": days[1]}
             events.append(one | {"probability": surely, "words": words})
     return told_courses, events
 

@@ -74,7 +74,9 @@ def test_what_is_constant_is_not_said_to_change(steady):
 
 
 def test_a_step_and_a_drift_are_found_and_dated(worn):
-    found = by_optic(courses(worn))
+    table = courses(worn)
+    assert [", ".join(names) for names in table.meta["rivals"]] == [*table["or"]]
+    found = by_optic(table)
     assert found["wollaston"]["course"] == "steps"
     assert found["wollaston"]["when"] == "2022-01-01 to 2022-07-01"
     assert found["hwp.theta"]["course"] == "drift"

@@ -266,6 +266,8 @@ def test_a_standard_of_another_source_is_not_that_of_the_dataset(make, fresh, ch
     table = add_standard(fresh, chain, data)
     assert np.isnan(fresh.accuracy["s_standard"]).all()
     assert "that of other sources" in table.meta["words"]
+    off = np.median(percent(table["s_standard"]))
+    assert f"dark is off by {off:.2g} %, and nothing like it was fitted" in fresh.verdict().cautions
     assert to_dict(fresh)["standards"][0]["source"] == "unpolarized"
 
 

@@ -386,9 +386,9 @@ class Model:
         """Return what each optic does, a row each, and of each of its steps first and last gap.
 
         See `astropolcal.calibration.fit.runs.RunsCalibration`; with the probability of the step,
-        and its rivals.
+        and its rivals. Last are the rivals of each row.
         """
-        own, rows, spans, days = {}, [], [], sorted(self.dates.isot)
+        own, rows, spans, others, days = {}, [], [], [], sorted(self.dates.isot)
         for term in self.terms:
             own.setdefault(term.what, []).append(term)
         for what, terms in own.items():
@@ -398,8 +398,8 @@ class Model:
             pairs = zip(terms, judged, strict=True)
             spans.append(
                 sorted(
-                    (*one.span(), 1 - one.chances["constant"], others)
-                    for term, (one, others, _) in pairs
+                    (*one.span(), 1 - one.chances["constant"], known)
+                    for term, (one, known, _) in pairs
                     if term.gap is not None
                 )
             )
@@ -410,12 +410,14 @@ class Model:
                 f"{days[a][:10]} to {days[b + 1][:10]}" for a, b, *_ in spans[-1]
             )
             rows.append(row | {"or": ", ".join(rivals)})
+            others.append(rivals)
         for what, told in self.weighed().items():
             if what == optic(what) and what not in map(optic, own):
                 row = {"what": what, "course": "constant", "probability": told.chances["constant"]}
                 rows.append(row | told.chances | {"when": "", "or": ""})
                 spans.append([])
-        return rows, spans
+                others.append([])
+        return rows, spans, others
 
     # ---- errors
 

@@ -341,11 +341,13 @@ def _elsewhere(calibration):
 
 
 def _badly_predicted(calibration):
-    """Say which data that no fit saw are farther off than left-out frames of their source."""
+    """Say which data that no fit saw are farther off than left-out frames, or have no such."""
     sources = {record.source for record in calibration.datasets}
     for one in calibration.fit.get("standards") or []:
-        times = median_of_known(one["chi"]) if one["source"] in sources else np.nan
-        if times > _CLEARLY:
+        if one["source"] not in sources:
+            off = median_of_known(one["s_standard_percent"])
+            yield f"{one['name']} is off by {off:.2g} %, and nothing like it was fitted"
+        elif (times := median_of_known(one["chi"])) > _CLEARLY:
             yield f"{one['name']} is {times:.2g} times as far off as left-out frames"
 
 

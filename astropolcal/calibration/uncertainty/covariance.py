@@ -401,7 +401,7 @@ def covariance_around(measurement, whitened, weighting, scatter):
         return white_covariance(measurement, whitened, weighting)
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
     slack = _inward(measurement, whitened, scatter)[-1] if whitened.held.any() else None
-    return sandwich(measurement, whitened, weighting, middle, slack, has_scatter=True)
+    return sandwich(measurement, whitened, weighting, middle, slack, scatter)
 
 
 def _middle(scatter, level, data, priors):
@@ -423,7 +423,7 @@ def widening(calibration):
     measurement, whitened, weighting = problem.measurement, problem.around(), problem.weighting
     scatter = _scatter_of(calibration, problem, whitened)
     middle = _middle(scatter, weighting.level, whitened.slopes, whitened.prior_slopes)
-    found = sandwich(measurement, whitened, weighting, middle, has_scatter=scatter is not None)
+    found = sandwich(measurement, whitened, weighting, middle, scatter=scatter)
     stated = found.stds * measurement.free.factors()
     plain = weighting.level * np.sqrt(np.diag(whitened.covariance()))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -444,19 +444,26 @@ def white_covariance(measurement, whitened, weighting):
     return Covariance(free.names, free.units, unknown, null=null / free.factors())
 
 
-def sandwich(measurement, whitened, weighting, middle, slack=None, *, has_scatter=False):
+def sandwich(
+    measurement, whitened, weighting, middle, slack=None, scatter=None, from_residuals=False
+):
     """Return the covariance from that of the pulls on the determined directions.
 
-    ``slack`` has further directions, each one standard error long, in the steps of the problem.
+    ``slack`` has further directions, each one standard error long, in the steps of the problem;
+    ``from_residuals`` says that residuals tell the pulls, as they do where they have a ``scatter``.
     """
+    slopes = whitened.slopes
     if weighting.follows is not None:
         # with a robust loss a datum far from the model pulls less back than its weight says
-        slopes, lost = whitened.slopes, 1 - weighting.follows
+        lost = 1 - weighting.follows
         stiff, axes = np.linalg.eigh(np.eye(len(middle)) - slopes.T @ (lost[:, None] * slopes))
         back = (axes / np.maximum(stiff, _STIFF)) @ axes.T
-        middle = back @ middle @ back
+        middle, slopes = back @ middle @ back, slopes @ back
     variances, vectors = np.linalg.eigh(middle)
-    few = _of_few(measurement, whitened, weighting.from_residuals or has_scatter)
+    freedom = measurement.n_data - whitened.n_taken
+    known = not (from_residuals or scatter is not None or weighting.from_residuals)
+    freedom = np.inf if known else freedom
+    few = _of_few(freedom, scatter, slopes @ vectors, variances)
     stds = np.sqrt(variances.clip(0)) * few
     # with fewer groups than directions a sum of outer products is singular
     stds = np.maximum(stds, _LEAST * stds.max(initial=0.0))
@@ -474,19 +481,19 @@ def sandwich(measurement, whitened, weighting, middle, slack=None, *, has_scatte
     return Covariance(free.names, free.units, matrix, factor=factor, null=null)
 
 
-def _of_few(measurement, whitened, from_residuals, more=0):
-    """Return by how much errors grow where few degrees of freedom tell the noise.
+def _of_few(freedom, scatter, slopes, variances):
+    """Return by how much errors grow where few degrees of freedom tell the noise, or the scatter.
 
     By the quantiles of Student's t, for 95 of 100 cases within two errors if noise is even;
-    ``more`` are directions besides those that the fit took.
+    ``slopes`` are the derivatives of the data to the directions that have the ``variances``.
     """
     # a calibration is read where there is no scipy
     from scipy.special import stdtrit
 
-    freedom = measurement.n_data - whitened.n_taken - more
-    if not from_residuals or freedom <= 0:
-        return 1.0
-    return max(1.0, stdtrit(freedom, _NORMAL[0]) / _NORMAL[1] / _NO_MATTER)
+    if scatter is not None:
+        freedom = np.minimum(freedom, scatter.freedom(slopes, variances))
+    times = stdtrit(np.maximum(freedom, 1.0), _NORMAL[0]) / _NORMAL[1] / _NO_MATTER
+    return np.where(freedom > 0, np.maximum(times, 1.0), 1.0)
 
 
 # ---- differences between datasets ----
@@ -590,7 +597,7 @@ def errors_at_bounds(measurement, whitened, scatter=None):
     n, level = measurement.n_data, measurement.weighting.level
     # columns of an orthonormal basis, and the root of how these are pulled
     variances, axes = np.linalg.eigh(_middle(scatter, level, *np.split(columns @ inverse, [n])))
-    few = _few_at_bounds(measurement, whitened, scatter)
+    few = _few_at_bounds(measurement, whitened, scatter, columns[:n] @ inverse @ axes, variances)
     root = inverse @ axes * np.sqrt(variances.clip(0)) * few
     without = np.linalg.norm(response @ root, axis=1) * per_unit[whitened.live]
     for name, told in released.items():
@@ -602,10 +609,12 @@ def errors_at_bounds(measurement, whitened, scatter=None):
     return {"inward": inward, "released": released}
 
 
-def _few_at_bounds(measurement, whitened, scatter):
+def _few_at_bounds(measurement, whitened, scatter, slopes, variances):
     """Return `_of_few` of what is released from its bounds."""
-    told = scatter is not None or measurement.weighting.from_residuals
-    return _of_few(measurement, whitened, told, more=int(whitened.held.sum()))
+    freedom = measurement.n_data - whitened.n_taken - int(whitened.held.sum())
+    known = scatter is None and not measurement.weighting.from_residuals
+    freedom = np.inf if known else freedom
+    return _of_few(freedom, scatter, slopes, variances)
 
 
 def _levels(measurement, whitened, scatter, columns):
@@ -613,7 +622,8 @@ def _levels(measurement, whitened, scatter, columns):
     level, size = measurement.weighting.level, np.linalg.norm(columns, axis=0)
     pulled = np.diag(_middle(scatter, level, *np.split(columns, [measurement.n_data])))
     along = np.where(size > 0, np.sqrt(pulled) / np.where(size > 0, size, 1.0), level)
-    return along * _few_at_bounds(measurement, whitened, scatter)
+    slopes = columns[: measurement.n_data]
+    return along * _few_at_bounds(measurement, whitened, scatter, slopes, pulled)
 
 
 def _inward(measurement, whitened, scatter):

@@ -620,7 +620,7 @@ def robust_covariance(calibration, groups="derotator"):
     # of one array with itself: a product of two copies is symmetric to rounding only
     pulls = np.array(pulls)
     middle = pulls.T @ pulls + prior.T @ prior
-    return sandwich(measurement, whitened, problem.weighting, middle, has_scatter=True)
+    return sandwich(measurement, whitened, problem.weighting, middle, from_residuals=True)
 
 
 # ---- as published --------------------------------------------------------------------------

@@ -14,12 +14,11 @@ from astropy.table import QTable
 from astropolcal.calibration.identifiability.linearized import STILL
 from astropolcal.calibration.identifiability.sky import settings_of, view_of_calibration, weights_of
 from astropolcal.calibration.noise.estimates import mean_of_known
+from astropolcal.calibration.noise.scatter import kind_of_source
 from astropolcal.calibration.system import model_error
 from astropolcal.calibration.uncertainty.covariance import full_covariance
-from astropolcal.chain import leaves
 from astropolcal.exceptions import ParameterError
 from astropolcal.files import columns
-from astropolcal.optics import LinearPolarizer
 from astropolcal.stokes import angle_error
 from astropolcal.units import angle_to_rad
 from astropolcal.words import check_choice
@@ -312,19 +311,13 @@ def paper_accuracies(calibration, targets=PAPER_TARGETS):
     return found if parts else []
 
 
-def _kind(source, chain):
+def _kind(source, chain=None):
     """Return which of the three calibrations a dataset belongs to, or None."""
-    words = (source or "").lower()
-    if "star" in words or "sky" in words:
-        # a polarized star does not tell s_sky, as its own
-        # polarization is fitted or from a catalogue
-        return "on_sky" if "unpolarized" in words else None
-    if "polarized" in words:
-        return "unpolarized" if "unpolarized" in words else "polarized"
-    if chain is None:
-        return None
-    # a table that does not say it; a polarizer in front does
-    return "polarized" if isinstance(leaves(chain)[0], LinearPolarizer) else None
+    kind = kind_of_source(source, chain)
+    if kind != "star":
+        return kind
+    # a polarized star does not tell s_sky, as its own polarization is fitted or from a catalogue
+    return "on_sky" if "unpolarized" in source.lower() else None
 
 
 def _parts_of_kinds(calibration):
@@ -345,7 +338,7 @@ def _parts_of_kinds(calibration):
         with np.errstate(divide="ignore", invalid="ignore"):
             # nothing was fitted: its rms over sqrt(n) is what s_mean is for a fit
             square = np.array(entry["s_standard_percent"], dtype=float) ** 2 / n
-        predicted.setdefault(_kind(entry["source"], None), []).append((own, square))
+        predicted.setdefault(_kind(entry["source"]), []).append((own, square))
     parts = {}
     for kind, several in (predicted | fitted).items():
         # a dataset may cover a part of the grid; the rest stays unknown
