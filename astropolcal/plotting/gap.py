@@ -321,7 +321,7 @@ def plot_cause_map(diagnosis, *, figure=None):
 # columns of the map
 _OTHER = "other"
 _FAMILIES = ("retardance", "rotation", "diattenuation", "depolarization", "beams, detector", _OTHER)
-_AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "linear": "linear"}
+_AXES = {"h": "along axes", "d": "at 45 deg", "c": "circular", "h_between_beams": "per beam"}
 
 
 def _cause_map(diagnosis):
