@@ -21,7 +21,7 @@ from astropolcal import progress
 from astropolcal.calibration.identifiability.linearized import ranked
 from astropolcal.chain import leaves
 from astropolcal.gap.attribution import ALIKE, DECIMALS, ENOUGH, Candidate, preference, scan
-from astropolcal.gap.cells import Cell, alike, count_runs, in_other_frame
+from astropolcal.gap.cells import BETWEEN_BEAMS, Cell, alike, count_runs, in_other_frame
 from astropolcal.gap.courses import alike_courses, real_courses
 from astropolcal.gap.shrinkage import foreseen, stability
 
@@ -615,6 +615,9 @@ def _grown(states, known, temper, most):
 
 def _continuations(found, most):
     """Return what may be added to a set: one cause, or one in each of the runs."""
+    # what is in one beam only looks like a cause of both, in place of which it is asked for
+    both = [o for o in found.candidates if not (o.cell and o.cell.kind.endswith(BETWEEN_BEAMS))]
+    found = replace(found, candidates=both)
     few = [one for one in _best_of(found, most) if one.evidence > ENOUGH]
     if found.probes is None or len(found.probes.runs) < 2:
         return [(one,) for one in few]
