@@ -364,10 +364,8 @@ def _worsens(after, before, scatter):
 def explained_by_one(model, library, *, cells=True):
     """Return whether a single cause leaves no more than noise."""
     found = _scanned(model, library, cells)
-    for one in _best_of(found, _WIDTH[0]):
-        if one.evidence > ENOUGH and model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE:
-            return True
-    return False
+    few = (one for one in _best_of(found, _WIDTH[0]) if one.evidence > ENOUGH)
+    return any(model.with_effect(*one.recipe, **_QUICK).p_value > _NOISE for one in few)
 
 
 def beside_one(base, selection):
