@@ -289,7 +289,7 @@ def test_a_listed_cause_is_exchanged_for_no_other_freedom_than_the_data_ask_for(
 def test_two_causes_that_follow_the_same_thing_may_be_one_that_no_table_has():
     setup = SETUPS["charis"]()
     first = Cell("in:hwp", "diattenuation_h", "harmonic:derotator:1")
-    for dependence, least, most in (("harmonic:derotator:1", 0.0, 0.2), ("step:30", 0.9, 1.0)):
+    for dependence, least, most in (("harmonic:derotator:1", 0.0, 0.2), ("step:25", 0.9, 1.0)):
         second = Cell("after:derotator", "rotation", dependence)
         with_first = dataclasses.replace(setup, truth=setup.with_cell(first, 0.02, 0.01))
         truth = with_first.with_cell(second, 0.03, 0.02)
