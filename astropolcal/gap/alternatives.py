@@ -389,8 +389,8 @@ def _best_alternative(chains, observations, made, found, say):
             tried = nominal_calibration(*asked)
             # where the fit leaves no polarization, as of a lamp that has none, any sign does
             optics = (leaf for chain in tried.chains for leaf in leaves(chain))
-            prisms = [leaf for leaf in optics if isinstance(leaf, WollastonPrism)]
-            if any(np.median(prism.efficiency) < NO_SPLITTER for prism in prisms):
+            prisms = (leaf.efficiency for leaf in optics if isinstance(leaf, WollastonPrism))
+            if any(np.median(one.value) < NO_SPLITTER for one in prisms if not one.fixed):
                 continue
             if _misfit(tried) < (most if best is None else _misfit(best[0])):
                 best = tried, asked, misfit, effect
